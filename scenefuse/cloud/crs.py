@@ -15,6 +15,10 @@ UTM = re.compile(r"WGS84 UTM (0?[1-9]|[1-5]\d|60)([NS])", re.IGNORECASE)
 MAX_BEYOND_DEG = 6.0
 # Coordinates this small are a site's own, unless the zero of their CRS lies where that is used.
 MAX_SITE_COORDINATE = 10_000.0
+# Units that GeoTIFF keys name by their EPSG codes, and their metres.
+LINEAR_UNITS = {9001: ("metre", 1.0), 9002: ("foot", 0.3048), 9003: ("US survey foot", 1200 / 3937)}
+# The feet of surveyors and of everybody else differ by less, which is a millimetre of a height.
+MAX_UNIT_RATIO = 1e-5
 
 
 def read_crs(text: str, where: str) -> pyproj.CRS:
@@ -65,12 +69,12 @@ def _named(text: str) -> pyproj.CRS | None:
         return None
 
 
-def usable(crs: pyproj.CRS, where: str) -> pyproj.CRS:
+def usable(crs: pyproj.CRS, where: str, local: bool = False) -> pyproj.CRS:
     """A CRS as its register has it, where it does.
 
     Raises:
-        StageError: its heights have another unit than its plane, it is neither projected nor geographic, or its axes
-            are a mirror image of east and north.
+        StageError: its heights have another unit than its plane, it is neither projected nor geographic nor, if that is
+            allowed, a site's own, or its axes are a mirror image of east and north.
     """
     crs = registered(crs)
     if [axis.direction for axis in plane(crs).axis_info[:2]] == ["south", "west"]:
@@ -78,12 +82,9 @@ def usable(crs: pyproj.CRS, where: str) -> pyproj.CRS:
             f"{where}: the axes of the CRS {crs.name} point south and west, a mirror image of the ground; name its"
             " variant with axes to the east and north, EPSG:5514 for EPSG:5513"
         )
-    units = {axis.unit_name for axis in crs.axis_info}
-    if plane(crs).is_projected and len(units) > 1:
-        raise StageError(
-            f"{where}: the CRS {crs.name} counts {' and '.join(sorted(units))}; give heights in the unit of the plane"
-        )
-    if not (plane(crs).is_projected or plane(crs).is_geographic):
+    if units := mixed_units(crs):
+        raise StageError(f"{where}: the CRS {crs.name} counts {units}; give heights in the unit of the plane")
+    if not (plane(crs).is_projected or plane(crs).is_geographic or (local and plane(crs).is_engineering)):
         raise StageError(
             f"{where}: the CRS {crs.name} is neither projected nor geographic; give coordinates in such a one"
         )
@@ -95,6 +96,40 @@ def registered(crs: pyproj.CRS) -> pyproj.CRS:
     # Older WKT names a way to WGS84 as well; for a CRS of its register PROJ knows better ones.
     known = (crs.source_crs if crs.is_bound and crs.source_crs is not None else crs).to_epsg()
     return crs if known is None else pyproj.CRS.from_epsg(known)
+
+
+def with_units(crs: pyproj.CRS, keys: dict[int, int]) -> pyproj.CRS:
+    """A projected CRS in the units of GeoTIFF keys, and with the heights that these name (GeoTIFF 1.1, annex B)."""
+    own = crs.axis_info[0].unit_conversion_factor
+    unit = LINEAR_UNITS.get(keys.get(3076, 0))
+    if unit is not None and abs(unit[1] / own - 1) > MAX_UNIT_RATIO:
+        about = crs.to_json_dict()
+        for axis in about["coordinate_system"]["axis"]:
+            axis["unit"] = {"type": "LinearUnit", "name": unit[0], "conversion_factor": unit[1]}
+        about.pop("id", None)
+        crs, own = pyproj.CRS.from_json_dict(about), unit[1]
+    try:
+        heights = pyproj.CRS.from_epsg(keys.get(4096, 0))
+        factor = heights.axis_info[0].unit_conversion_factor
+    except pyproj.exceptions.CRSError:
+        heights, factor = None, own
+    unit = LINEAR_UNITS.get(keys.get(4099, 0))
+    if unit is not None and abs(unit[1] / factor - 1) > MAX_UNIT_RATIO:
+        name = "heights" if heights is None else f"{heights.name} in {unit[0]}"
+        heights = pyproj.CRS.from_wkt(f'VERT_CS["{name}",VERT_DATUM["{name}",2005],UNIT["{unit[0]}",{unit[1]}]]')
+    return crs if heights is None else pyproj.crs.CompoundCRS(f"{crs.name} + {heights.name}", [crs, heights])
+
+
+def mixed_units(crs: pyproj.CRS) -> str | None:
+    """The units of a CRS's axes, where these are lengths of clearly different units."""
+    found = {axis.unit_name: axis.unit_conversion_factor for axis in crs.axis_info}
+    mixed = not plane(crs).is_geographic and max(found.values()) / min(found.values()) - 1 > MAX_UNIT_RATIO
+    return " and ".join(sorted(found)) if mixed else None
+
+
+def has_place(crs: str | None) -> bool:
+    """Whether a CRS lies somewhere on the earth, as a site's own system does not."""
+    return crs is not None and not plane(pyproj.CRS.from_user_input(crs)).is_engineering
 
 
 def plane(crs: pyproj.CRS) -> pyproj.CRS:
@@ -138,6 +173,8 @@ def check_place(crs: str, points: Array, source: Path) -> None:
 def check_in_area(crs: pyproj.CRS, points: Array, where: str, beyond_deg: float = MAX_BEYOND_DEG) -> Array:
     """(N, 2) longitude, latitude of points (N, 3) in a CRS, so far beyond its area at most; StageError as of
     `to_wgs84`."""
+    if plane(crs).is_engineering:
+        raise StageError(f"{where}: {crs.name} is a site's own system, which has no place on the earth; name a CRS")
     found = _in_degrees(crs, points[:, :2])
     strange = ~_in_area(crs, found, beyond_deg)
     if strange.any():

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, voxel_downsample, write_cloud
+from scenefuse.cloud.crs import has_place
 from scenefuse.cloud.readers.columns import AT_ONCE
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.machine import use_threads
@@ -183,7 +184,7 @@ def photo_rows(
                 "photo": int(view.name),
                 **{axis: float(f"{at:.7g}") for axis, at in zip("xyz", view.centre)},
             }
-            if frame is not None and frame.crs is not None:
+            if frame is not None and has_place(frame.crs):
                 latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
                 row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
                 row["altitude_m"] = round(altitude + gps_higher, 3)

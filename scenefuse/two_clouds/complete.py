@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scenefuse.cloud.cloud_file import CloudFile
 from scenefuse.cloud.clouds import MAX_STEP, Cloud, spacing
 from scenefuse.cloud.import_cloud import unit_and_name
-from scenefuse.cloud.readers.columns import COLOR
+from scenefuse.cloud.readers.columns import AT_ONCE, COLOR
 from scenefuse.cloud.readers.las import las_crs
 from scenefuse.cloud.tiled_cloud import ROW_OF_TILE, Rows
 from scenefuse.cloud.write_las import LAS_DESCRIPTIONS, finer, las_writer
@@ -34,11 +34,8 @@ from scenefuse.fuse.write import (
 )
 
 FILES = ("completed.ply", "completed.laz", "completed.json")
-CHUNK = 1_000_000
-"""Points of a LAS file that are copied at a time."""
-AXES = ("X", "Y", "Z")
-MAX_INTEGER = np.iinfo(np.int32).max
-"""Integers of a LAS file's coordinates, and the greatest of them."""
+# Integers of a LAS file's coordinates, and the greatest of them.
+AXES, MAX_INTEGER = ("X", "Y", "Z"), np.iinfo(np.int32).max
 
 
 @dataclass(frozen=True)
@@ -189,7 +186,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
         header.add_extra_dims([laspy.ExtraBytesParams(names[n], kind, described[n]) for n, kind in types.items()])
         with las_writer(path, header) as writer:
             brightest, first = 0, 0
-            for chunk in reader.chunk_iterator(CHUNK):
+            for chunk in reader.chunk_iterator(AT_ONCE):
                 stay = ~np.isin(np.arange(first, first + len(chunk)), done.removed)
                 first, chunk = first + len(chunk), chunk[stay]
                 part = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)

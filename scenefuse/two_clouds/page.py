@@ -11,13 +11,11 @@ from scenefuse.core.transforms import Array, Sim3, rotation_between
 from scenefuse.report.page import document, figure, view_section
 from scenefuse.report.values import flatten, number
 from scenefuse.report.view import REMOVED, View, merge, thin, within
+from scenefuse.report.view_scene import VIEW_POINTS
 from scenefuse.two_clouds.complete import Completed
 
-VIEW_POINTS = 300_000
+# How far around the object the view shows the scene, over the object's diagonal.
 VIEW_REACH = 0.35
-"""How far around the object the view shows the scene, over the object's diagonal."""
-AZIMUTH_DEG, ELEVATION_DEG = -60.0, 20.0
-UP = np.array([0.0, 0.0, 1.0])
 ROWS = {
     "scale": "scale",
     "scale_sd_log": "its standard deviation (log)",
@@ -74,7 +72,8 @@ def write_page(
 
 def view_of(name: str, done: Completed, up: Array | None, unit: str) -> View:
     """The 3D view of the completed scene around what was added, before and after."""
-    level = Sim3(1.0, rotation_between(UP if up is None else up, UP), np.zeros(3))
+    upright = np.array([0.0, 0.0, 1.0])
+    level = Sim3(1.0, rotation_between(upright if up is None else up, upright), np.zeros(3))
     added = done.added if len(done.added) else done.before
     corners = np.percentile(added.points, [0.5, 99.5], axis=0)
     middle = np.floor(corners.mean(0))
@@ -91,7 +90,7 @@ def view_of(name: str, done: Completed, up: Array | None, unit: str) -> View:
     found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
     names = {done.source: f"added from {name}"}
     sources = {0: "scene"} | {code: names.get(code, f"{code} in the scene") for code in found}
-    return View(thinned, sources, unit, low, high, AZIMUTH_DEG, ELEVATION_DEG, len(before), len(after))
+    return View(thinned, sources, unit, low, high, -60.0, 20.0, len(before), len(after))
 
 
 def _changes(done: Completed, scene_points: int) -> str:

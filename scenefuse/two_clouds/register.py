@@ -218,12 +218,14 @@ def _notes(object: Path, scene: Path) -> list[str]:
         return []
     import pyproj
 
+    from scenefuse.cloud.crs import mixed_units
+
     own, other = (None if text is None else pyproj.CRS.from_wkt(text) for text in texts)
     notes = [
-        f"{path} counts its plane in {units[0]} and its heights in {units[-1]}, as its CRS says: no turned object fits;"
-        " bring both into one unit"
+        f"{path} counts its plane and its heights in {units}, as its CRS says: no turned object fits; bring both into"
+        " one unit"
         for path, crs in ((object, own), (scene, other))
-        if crs is not None and len(set(units := [axis.unit_name for axis in crs.axis_info])) > 1
+        if crs is not None and (units := mixed_units(crs))
     ]
     if own is None or own == other:
         return notes

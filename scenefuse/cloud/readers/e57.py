@@ -11,7 +11,9 @@ from scenefuse.cloud.readers.columns import COLOR, POSITION, Columns
 
 
 def read_e57(path: Path, at_once: int) -> Iterator[Columns]:
-    """All scans of the file, each moved by its pose, so many points at a time; points marked as invalid are left out.
+    """All scans of the file, each moved by its pose, so many points at a time.
+
+    Rays without return, marked as invalid or at the scanner's own place, have no position: they are NaN.
 
     Colours and intensities are read where every scan has them.
     """
@@ -40,9 +42,7 @@ def _scan(file: Any, header: Any, colored: bool, measured: bool, at_once: int) -
     states = ("cartesianInvalidState", "sphericalInvalidState")
     more = ("intensity",) if measured else ()
     wanted = [name for name in (*cartesian, *spherical, *color, *more, *states) if name in header.point_fields]
-    # Fractions of 1, or bytes and 16 bits.
-    columns_of = libe57.StructureNode(header.points.prototype())
-    real = {name: not isinstance(columns_of[name], libe57.IntegerNode) for name in color}
+    limits = [_limits(header, name) for name in color]
     buffer = {name: np.empty(min(header.point_count, at_once)) for name in wanted}
     buffers = libe57.VectorSourceDestBuffer()
     for name, values in buffer.items():
@@ -57,19 +57,43 @@ def _scan(file: Any, header: Any, colored: bool, measured: bool, at_once: int) -
             level = distance * np.cos(elevation)
             points = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
             state = states[1]
-        found = dict(zip(POSITION, (points @ turn.T + shift).T))
-        found |= {name: columns[own].astype(np.float32 if real[own] else np.uint16) for name, own in zip(COLOR, color)}
-        found |= {name: columns[name].astype(np.float32) for name in more}
-        valid = columns[state] == 0 if state in columns else np.ones(len(points), bool)
-        yield {name: values[valid] for name, values in found.items()}
+        points[~points.any(1) | (columns[state] != 0 if state in columns else False)] = np.nan
+        found: Columns = dict(zip(POSITION, (points @ turn.T + shift).T))
+        for name, own, (low, high) in zip(COLOR, color, limits):
+            share = (columns[own] - low) / (high - low)
+            found[name] = (
+                share.astype(np.float32) if high == 1 else np.clip(np.rint(255 * share), 0, 255).astype(np.uint8)
+            )
+        yield found | {name: columns[name].astype(np.float32) for name in more}
+
+
+def _limits(header: Any, name: str) -> tuple[float, float]:
+    """The least and the greatest a colour can be: by the scan's limits, else by the type of the column; 0 and 1 where
+    the file does not say."""
+    from pye57 import libe57
+
+    node, limits = header.node, None
+    if node.isDefined("colorLimits"):
+        limits = node["colorLimits"]
+    ends = [f"{name}{end}" for end in ("Minimum", "Maximum")]
+    if limits is not None and all(limits.isDefined(end) for end in ends):
+        low, high = (float(limits[end].value()) for end in ends)
+    else:
+        column = libe57.StructureNode(header.points.prototype())[name]
+        whole = isinstance(column, libe57.IntegerNode)
+        low, high = (float(column.minimum()), float(column.maximum())) if whole else (0.0, 1.0)
+    # A limit beyond 16 bits is that of the type of number.
+    return (low, high) if 0 <= low < high <= np.iinfo(np.uint16).max else (0.0, 1.0)
 
 
 def _pose(header: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (3, 3) and position (3,) of a scan in its file."""
+    """Rotation (3, 3) and position (3,) of a scan in its file; parts that are absent change nothing."""
     from scipy.spatial.transform import Rotation
 
     if not header.has_pose():
         return np.eye(3), np.zeros(3)
-    rotation, translation = header.pose["rotation"], header.pose["translation"]
-    turn = Rotation.from_quat([rotation[part].value() for part in "xyzw"]).as_matrix()
-    return turn, np.array([translation[part].value() for part in "xyz"])
+    turn, shift = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
+    for values, part, axes in ((turn, "rotation", "xyzw"), (shift, "translation", "xyz")):
+        if header.pose.isDefined(part):
+            values[:] = [header.pose[part][axis].value() for axis in axes]
+    return Rotation.from_quat(turn if turn.any() else [0, 0, 0, 1]).as_matrix(), shift

@@ -1,5 +1,6 @@
 """LAS and LAZ read: points, what the format says of them, and the coordinate system."""
 
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ def las_crs(path: Path) -> str | None:
         return None
     import laspy
 
+    _check_header(path)
     with laspy.open(path) as file:
         crs = _crs(file.header)
     return None if crs is None else crs.to_wkt()
@@ -67,6 +69,7 @@ def read_las(path: Path, at_once: int) -> Iterator[Columns]:
 
     with laspy.open(path) as file:
         form, count = file.header.point_format, 0
+        at_once = max(1, min(at_once, 256 * AT_ONCE // form.size))  # however wide the header says that a point is
         named = [*POSITION, *(COLOR if set(COLOR) <= set(form.dimension_names) else ())]
         for points in file.chunk_iterator(at_once):
             count += len(points)
@@ -83,12 +86,46 @@ def read_las(path: Path, at_once: int) -> Iterator[Columns]:
             raise StageError(f"{path} is cut short: its last {missing} points are missing; copy it again")
 
 
+def _check_header(path: Path) -> None:
+    """Refuse a header that counts more than the file holds, before a library believes it (LAS 1.4 R15, 2.4).
+
+    Raises:
+        StageError: the file is cut short.
+        ValueError: it is no LAS file.
+    """
+    with open(path, "rb") as file:
+        head = file.read(375)
+        there = file.seek(0, 2)
+    if len(head) < 227 or not head.startswith(b"LASF"):
+        raise ValueError("it does not begin as LAS does")
+    begin, records, kind, length, count = struct.unpack_from("<IIBHI", head, 96)
+    if head[25] >= 4 and len(head) == 375:
+        start, more, long_count = struct.unpack_from("<QIQ", head, 235)
+        count = long_count or count
+        if more and there - start < 60 * more:
+            raise StageError(f"{path} is cut short: its last records are missing; copy it again")
+    if 54 * records > begin or length < 20:
+        raise ValueError("its header counts more records than it holds")
+    missing = count - max(there - begin, 0) // length
+    if begin > there or (missing > 0 and not kind & 128):
+        raise StageError(f"{path} is cut short: its last {missing} points are missing; copy it again")
+
+
 def _crs(header: Any) -> Any:
     """The pyproj CRS of a LAS header, or None; an entry that pyproj cannot read counts as none."""
     from pyproj.exceptions import CRSError
 
+    from scenefuse.cloud.crs import with_units
+
     try:
-        return header.parse_crs()
+        crs = header.parse_crs()
+        keys = {
+            key.id: key.value_offset
+            for record in header.vlrs.get("GeoKeyDirectoryVlr")
+            for key in record.geo_keys
+            if key.tiff_tag_location == 0
+        }
+        return crs if crs is None or not crs.is_projected or crs.is_compound else with_units(crs, keys)
     except CRSError as error:
         print(f"the file's coordinate system cannot be read and is ignored: {error}", flush=True)
         return None
