@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.cloud_files import UTM, write_e57
 from support.planted import errors, plant
+from support.registered_pair import registered_at_once
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.cloud.readers.las import las_crs
@@ -66,7 +67,7 @@ def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, 
 def test_a_note_says_that_the_object_s_own_crs_is_not_used(tmp_path, house, capsys, monkeypatch):
     write_laz(tmp_path / "house.laz", house.object, UTM, "EPSG:32633")
     write_laz(tmp_path / "scene.laz", house.scene, UTM, "EPSG:32632")
-    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    registered_at_once(monkeypatch, house.scene_from_object)
     assert register(object=tmp_path / "house.laz", scene=tmp_path / "scene.laz", out=tmp_path / "out") == 0
     (note,) = value(read_json(tmp_path / "out/transform.json"), "notes")
     assert "house.laz is in WGS 84 / UTM zone 33N, which is not used" in note and "UTM zone 32N" in note
@@ -133,7 +134,7 @@ def test_the_transform_is_kept_when_the_object_cannot_be_written(tmp_path, house
     write_cloud(tmp_path / "scene.ply", house.scene)
     write_cloud(tmp_path / "house.ply", house.object)
     monkeypatch.setattr("scenefuse.two_clouds.register.write_cloud", full_disk)
-    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    registered_at_once(monkeypatch, house.scene_from_object)
     with pytest.raises(StageError, match="could not be written"):
         register(object=tmp_path / "house.ply", scene=tmp_path / "scene.ply", out=tmp_path / "out")
     assert value(read_json(tmp_path / "out/transform.json"), "status") == "registered"
@@ -144,7 +145,7 @@ def test_a_column_with_a_space_in_its_name_is_written(tmp_path, house, monkeypat
     columns = np.column_stack([house.object.points, np.arange(len(house.object))])
     header = "x,y,z,scan angle"
     np.savetxt(tmp_path / "house.csv", columns, header=header, comments="", delimiter=",", fmt="%.9g")
-    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    registered_at_once(monkeypatch, house.scene_from_object)
     files = {"object": tmp_path / "house.csv", "scene": tmp_path / "scene.ply"}
     assert register(**files, out=tmp_path / "out") == 0
     placed = read_cloud(tmp_path / "out/object_in_scene.ply")

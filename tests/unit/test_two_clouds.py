@@ -13,6 +13,7 @@ from laspy.vlrs.vlrlist import VLRList
 from scipy.spatial import cKDTree
 from support.cloud_files import UTM
 from support.planted import plant
+from support.registered_pair import registered_at_once
 
 from scenefuse.cloud.cloud_file import EVERYWHERE, CloudFile
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
@@ -319,8 +320,7 @@ def test_the_page_shows_the_decision_the_scene_in_3d_and_the_matrix_and_fetches_
 
 
 def test_a_refused_pose_leaves_no_completed_scene_and_nothing_of_an_earlier_run(tmp_path, house, monkeypatch):
-    strict = replace(LITTLE, fine=replace(LITTLE.fine, min_f_score=0.99))
-    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (strict, 0))
+    registered_at_once(monkeypatch, house.scene_from_object, registered=False)
     out = tmp_path / "out"
     out.mkdir()
     for name in ("completed.ply", "completed.laz", "completed.json", "transform.txt", "report.html"):
@@ -334,7 +334,7 @@ def test_a_refused_pose_leaves_no_completed_scene_and_nothing_of_an_earlier_run(
 
 
 def test_noise_of_a_laz_is_not_searched_and_stays_in_the_completed_laz_alone(tmp_path, house, monkeypatch, capsys):
-    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    registered_at_once(monkeypatch, house.scene_from_object)
     write_cloud(tmp_path / "house.ply", house.object)
     write_laz(tmp_path / "clean.laz", house.scene, np.zeros(3), None)
     las = laspy.read(tmp_path / "clean.laz")
@@ -452,7 +452,7 @@ def test_points_at_zero_that_fill_a_whole_part_are_none_either(tmp_path, monkeyp
     write_cloud(tmp_path / "yard.ply", Cloud(np.concatenate([scene.points, np.zeros((1200, 3))])))
     held = CloudFile.of(tmp_path / "yard.ply")
     assert held.summary.count == len(held.part) == len(scene)
-    assert any("1200 points at 0 0 0, far from all others, of" in note for note in held.notes)
+    assert any("1200 points at exactly 0 0 0 of" in note for note in held.notes)
     assert sum(len(cloud) for _, cloud in held.parts()) == len(held.near(*EVERYWHERE)[0]) == len(scene)
     # A site whose own zero lies in it has a point there.
     write_cloud(tmp_path / "site.ply", Cloud(np.concatenate([sheet(0, 4).points, np.zeros((1, 3))])))
@@ -460,7 +460,7 @@ def test_points_at_zero_that_fill_a_whole_part_are_none_either(tmp_path, monkeyp
 
 
 def test_an_object_may_be_anywhere_whatever_crs_its_file_names(tmp_path, house, monkeypatch):
-    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    registered_at_once(monkeypatch, house.scene_from_object)
     write_laz(tmp_path / "house.laz", house.object, np.zeros(3), "EPSG:25832")
     write_cloud(tmp_path / "yard.ply", house.scene)
     assert register(object=tmp_path / "house.laz", scene=tmp_path / "yard.ply", out=tmp_path / "out") == 0
@@ -508,7 +508,7 @@ def test_what_stands_beside_an_object_is_not_a_second_one(house):
 
 
 def test_a_second_place_is_told_in_a_note(tmp_path, house, monkeypatch, capsys):
-    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    registered_at_once(monkeypatch, house.scene_from_object)
     monkeypatch.setattr("scenefuse.two_clouds.register.second_place", lambda *known: np.array([20.0, -3, 5.25]))
     write_cloud(tmp_path / "house.ply", house.object)
     write_cloud(tmp_path / "yard.ply", house.scene)

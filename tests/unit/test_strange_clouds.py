@@ -1,0 +1,516 @@
+"""Cloud files as people have them: situations of public complaints about other programs (docs/inputs.md), read
+right."""
+
+import io
+import json
+import struct
+
+import laspy
+import numpy as np
+import pye57
+import pyproj
+import pytest
+from laspy.vlrs.known import GeoKeyDirectoryVlr
+from PIL import Image
+from pye57 import libe57
+
+from scenefuse.cloud.cloud_file import CloudFile
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.cloud.crs import has_place, mixed_units, to_wgs84
+from scenefuse.cloud.formats import columns_in_parts
+from scenefuse.cloud.import_cloud import import_scene_cloud
+from scenefuse.cloud.readers.las import las_crs
+from scenefuse.core.stage import StageError, read_json, value
+
+GRID = [[float(x), float(y), x * y / 7] for x in range(1, 9) for y in range(1, 6)]
+COLORS = [[10 * x, 20 * y, 255 - 10 * x] for x in range(1, 9) for y in range(1, 6)]
+HEAD = "ply\nformat ascii 1.0\nelement vertex {}\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+
+
+def rows(separator=" ", *columns):
+    """The grid's points and some columns, a line each."""
+    return [separator.join(map(str, row)) for row in zip(*zip(*GRID), *columns)]
+
+
+def reds(cloud):
+    return None if cloud.colors is None else cloud.colors[:, 0].tolist()
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("blank.xyz", "\n\n".join(rows())),
+        ("blank_crlf.ply", HEAD.format(40) + "end_header\n\r\n" + "\r\n\r\n".join(rows())),
+        ("mark.ply", "\ufeff" + HEAD.format(40) + "end_header\n\ufeff" + "\n".join(rows())),
+        ("carriage.xyz", "\r".join(rows())),
+        ("quoted.csv", "x,y,z\n" + "\n".join('"' + '","'.join(map(str, row)) + '"' for row in GRID)),
+        ("spaced.csv", "x , y , z\n" + "\n".join(rows(" , "))),
+        ("pipes.txt", "x|y|z\n" + "\n".join(rows("|"))),
+        ("tabs.txt", "x\ty\tcode\tz\n" + "\n".join(f"{x}\t{y}\t\t{z}" for x, y, z in GRID)),
+        (
+            "empty.csv",
+            "x,y,z,code\n" + "\n".join(line + ("," if k % 2 else ",tree") for k, line in enumerate(rows(","))),
+        ),
+        ("quoted_words.csv", "x,y,z,what\n" + "\n".join(line + ',"tree, small"' for line in rows(","))),
+        (
+            "trimmed.csv",
+            "x,y,z,code\n" + "\n".join(line + (",7" if k % 2 == 0 else "") for k, line in enumerate(rows(","))),
+        ),
+        ("fortran.txt", "\n".join(f"{x}D+00 {y}d0 {z}" for x, y, z in GRID)),
+        ("comment.txt", "# Maß\n" + "\n".join(line + " # nach Süden" for line in rows())),
+        ("paraview.csv", "Points:0,Points:1,Points:2\n" + "\n".join(rows(","))),
+        ("pts.pts", "x y z\n" + "\n".join(rows())),
+        ("point.ply", HEAD.format(40).replace("float x", "int x") + "end_header\n" + "\n".join(rows())),
+        (
+            "comment_ü.ply",
+            HEAD.format(40).replace("element", "comment Maßstab\nelement", 1) + "end_header\n" + "\n".join(rows()),
+        ),
+        (
+            "pcd.pcd",
+            "# Gerät\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nWIDTH 40\nHEIGHT 1\nDATA ascii\n" + "\n\n".join(rows()),
+        ),
+    ],
+    ids=lambda text: text[:20] if text.isprintable() else "",
+)
+def test_numbers_are_read_whatever_stands_around_them(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content.encode())
+    np.testing.assert_allclose(read_cloud(tmp_path / name).points, GRID)
+
+
+@pytest.mark.parametrize(
+    "missing", ["nan", "-nan(ind)", "NULL", "NA", "n/a", "", "None", "1.#QNAN", "-1.#IND", "#N/A", "-"]
+)
+def test_rows_whose_number_is_missing_are_left_out_and_counted(tmp_path, missing):
+    lines = rows(",")
+    lines[3], lines[7] = f"{missing},1,2", f'1,"{missing}",2'
+    (tmp_path / "a.csv").write_text("x,y,z\n" + "\n".join([*lines[:5], "x,y,z", "-- page 2 --", *lines[5:]]))
+    read = CloudFile.of(tmp_path / "a.csv")
+    np.testing.assert_allclose(read.part.points, np.delete(GRID, [3, 7], axis=0))
+    assert any("4 rows without a finite position" in note for note in read.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("a.xyz", "\n".join([*rows()[:-1], "1 2"]), "a.xyz is cut short: it ends within a row, line 40; copy it again"),
+        ("a.xyz", "\n".join(["1 2 3 4", *rows()]), "line 2, has 3 columns, the first row 4: .*; correct that line, or"),
+        ("a.ply", HEAD.format(41) + "end_header\n" + "\n".join(rows()), "cut short: its last 1 points are missing"),
+        ("a.ply", HEAD.format(10**12) + "end_header\n" + "\n".join(rows()), "its last 999999999960 points are missing"),
+        ("a.ply", HEAD.format(-1) + "end_header\n", "its header counts less than no rows"),
+        (
+            "a.ply",
+            HEAD.replace("ascii", "binary_little_endian").format(10**12) + "end_header\n",
+            "10{12} points are mis",
+        ),
+        (
+            "a.pcd",
+            "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1000000\nHEIGHT 1000000\nDATA binary\n",
+            "10{12} points are",
+        ),
+        (
+            "a.pcd",
+            "FIELDS x y z\nSIZE 4 4\nTYPE F F F\nWIDTH 9\nHEIGHT 1\nDATA binary\n",
+            "does not say what its rows hold",
+        ),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "vertices that it does not have.; export it again"),
+    ],
+)
+def test_a_cut_file_is_told_from_a_strange_one(tmp_path, name, content, sentence):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(StageError, match=sentence):
+        read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "names",
+    ["r,g,b", "R[0-255],G[0-255],B[0-255]", "Rot,Grün,Blau", "rouge,vert,bleu", "rojo,verde,azul", "rgb_r,rgb_g,rgb_b",
+     "diffuse_red,diffuse_green,diffuse_blue", "Color.R,Color.G,Color.B", "scalar_red,scalar_green,scalar_blue"],
+)  # fmt: skip
+def test_colours_are_found_by_their_names(tmp_path, names):
+    (tmp_path / "a.csv").write_text(f"X[m],Y[m],Z[m],{names}\n" + "\n".join(rows(",", *zip(*COLORS))), "utf-8")
+    assert read_cloud(tmp_path / "a.csv").colors.tolist() == COLORS
+
+
+def test_one_name_of_a_colour_alone_is_none(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z,vert,h,b\n" + "\n".join(rows(",", *zip(*COLORS))))
+    read = read_cloud(tmp_path / "a.csv")
+    assert read.colors is None and set(read.fields) == {"vert", "h", "b"}
+
+
+def test_columns_without_names_are_colours_only_where_they_must_be(tmp_path):
+    rng = np.random.default_rng(0)
+    bright, back, kind = rng.integers(0, 1000, 40), rng.integers(1, 4, 40), np.full(40, 2)
+    (tmp_path / "flown.txt").write_text("\n".join(rows(" ", bright, back, kind)))
+    read = CloudFile.of(tmp_path / "flown.txt")
+    assert read.part.colors is None and any("3 of its columns have no names" in note for note in read.notes)
+    (tmp_path / "shares.txt").write_text("\n".join(rows(" ", *rng.random((3, 40)))))
+    assert read_cloud(tmp_path / "shares.txt").colors is None
+    (tmp_path / "photo.txt").write_text("\n".join(rows(" ", *zip(*COLORS))))
+    read = CloudFile.of(tmp_path / "photo.txt")
+    assert read.part.colors.tolist() == COLORS
+    assert any("columns 4 to 6 are taken for red, green and blue" in note for note in read.notes)
+
+
+@pytest.mark.parametrize("most", [1.0, 255.0])
+def test_real_colours_that_overshoot_a_little_are_clipped(tmp_path, most):
+    share = np.linspace(0, 1, 40)
+    share[[7, 8]] = 1.05, -0.02
+    colors = "".join(f"property float {name}\n" for name in ("red", "green", "blue"))
+    lines = rows(" ", *[share * most] * 3)
+    (tmp_path / "a.ply").write_text(HEAD.format(40) + colors + "end_header\n" + "\n".join(lines))
+    (tmp_path / "a.obj").write_text("".join(f"v {line}\n" for line in lines))
+    wanted = np.rint(255 * share.clip(0, 1))
+    assert reds(read_cloud(tmp_path / "a.ply")) == reds(CloudFile.of(tmp_path / "a.obj").part) == wanted.tolist()
+
+
+@pytest.mark.parametrize(("factor", "stray"), [(1, 0), (1, 60_000), (256, 0), (257, 0)])
+def test_colours_of_las_are_those_of_the_bits_that_all_points_use(tmp_path, factor, stray):
+    las = laspy.LasData(laspy.LasHeader(point_format=2, version="1.2"))
+    las.x, las.y, las.z = np.random.default_rng(0).random((3, 256))
+    las.red = las.green = las.blue = (np.arange(256) * factor).astype(np.uint16)
+    las.red[3] = stray or las.red[3]
+    las.write(str(tmp_path / "a.las"))
+    found = CloudFile.of(tmp_path / "a.las").part.colors[:, 1]
+    assert np.abs(found - np.arange(256.0)).max() <= 1
+
+
+def e57(path, columns, prototype, build=lambda image, scan: None):
+    """One scan: columns of numbers, their nodes, and what `build` adds to it."""
+    file = pye57.E57(str(path), mode="w")
+    image = file.image_file
+    kinds, buffers, held = libe57.StructureNode(image), libe57.VectorSourceDestBuffer(), []
+    count = len(columns["cartesianX"])
+    for name, values in columns.items():
+        kinds.set(name, prototype(image, name))
+        held.append(np.array(values, float))
+        buffers.append(libe57.SourceDestBuffer(image, name, held[-1], count, True, True))
+    scan = libe57.StructureNode(image)
+    points = libe57.CompressedVectorNode(image, kinds, libe57.VectorNode(image, True))
+    build(image, scan)
+    scan.set("points", points)
+    file.data3d.append(scan)
+    points.writer(buffers).write(count)
+    file.close()
+
+
+def structure(image, **numbers):
+    node = libe57.StructureNode(image)
+    for name, number in numbers.items():
+        node.set(name, libe57.FloatNode(image, float(number)))
+    return node
+
+
+def real(image, name):
+    return libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE)
+
+
+AXES = ("cartesianX", "cartesianY", "cartesianZ")
+
+
+@pytest.mark.parametrize("parts", [("rotation",), ("translation",), ("rotation", "translation"), ()])
+@pytest.mark.parametrize("zero", [False, True])
+def test_parts_of_a_pose_that_are_absent_change_nothing_and_rays_without_return_are_left_out(tmp_path, parts, zero):
+    def build(image, scan):
+        pose = libe57.StructureNode(image)
+        if "rotation" in parts:  # a quarter turn about z, or no turn at all
+            pose.set("rotation", structure(image, w=0 if zero else 0.5**0.5, x=0, y=0, z=0 if zero else 0.5**0.5))
+        if "translation" in parts:
+            pose.set("translation", structure(image, x=100, y=200, z=300))
+        scan.set("pose", pose)
+
+    points = np.vstack([GRID, np.zeros((6, 3))])
+    e57(tmp_path / "a.e57", dict(zip(AXES, points.T)), real, build)
+    read = CloudFile.of(tmp_path / "a.e57")
+    wanted = np.array(GRID)
+    if "rotation" in parts and not zero:
+        wanted = np.column_stack([-wanted[:, 1], wanted[:, 0], wanted[:, 2]])
+    wanted = wanted + ([100, 200, 300] if "translation" in parts else [0, 0, 0])
+    np.testing.assert_allclose(read.part.points, wanted, atol=1e-12)
+    assert any("6 rows without a finite position" in note for note in read.notes)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 1023), (0, 4095), (0, 255), (100, 300)])
+def test_colours_of_e57_have_the_scan_s_limits(tmp_path, low, high):
+    def build(image, scan):
+        ends = {
+            f"color{c}{end}": n for c in ("Red", "Green", "Blue") for end, n in (("Minimum", low), ("Maximum", high))
+        }
+        scan.set("colorLimits", structure(image, **ends))
+
+    share = np.linspace(0, 0.2, 40)  # a dark scan
+    columns = dict(zip(AXES, np.array(GRID).T)) | {
+        f"color{c}": low + share * (high - low) for c in ("Red", "Green", "Blue")
+    }
+    e57(tmp_path / "a.e57", columns, real, build)
+    assert reds(read_cloud(tmp_path / "a.e57")) == np.rint(255 * share).tolist()
+
+
+def test_scaled_integers_of_e57_are_scaled(tmp_path):
+    def node(image, name):
+        return libe57.ScaledIntegerNode(image, 0, -(10**9), 10**9, 0.001, 0.0)
+
+    e57(tmp_path / "a.e57", dict(zip(AXES, np.array(GRID).T)), node)
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.e57").points, GRID, atol=0.0005)
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary"])
+@pytest.mark.parametrize("kind", ["F", "U"])
+def test_packed_colours_of_pcd_as_a_real_number_or_an_integer(tmp_path, data, kind):
+    packed = np.array([r << 16 | g << 8 | b for r, g, b in COLORS], np.uint32)
+    table = np.empty(40, [("xyz", "<f4", 3), ("pad", "u1", 5), ("rgb", "<u4")])
+    table["xyz"], table["rgb"] = GRID, packed
+    shown = [repr(float(n)) for n in packed.view(np.float32).astype(np.float64)] if kind == "F" else packed.tolist()
+    head = f"FIELDS x y z _ rgb\nSIZE 4 4 4 1 4\nTYPE F F F U {kind}\nCOUNT 1 1 1 5 1\nWIDTH 8\nHEIGHT 5\nDATA {data}\n"
+    text = "\n".join(rows(" ", *[[0] * 40] * 5, shown)).encode()
+    (tmp_path / "a.pcd").write_bytes(head.encode() + (text if data == "ascii" else table.tobytes()))
+    read = read_cloud(tmp_path / "a.pcd")
+    assert read.colors.tolist() == COLORS and not read.fields
+
+
+def test_returns_at_the_scanner_s_own_place_are_no_points(tmp_path):
+    around = np.vstack([np.array(GRID) - [4, 3, 2], np.zeros((12, 3))])
+    write_cloud(tmp_path / "lidar.ply", Cloud(around))
+    read = CloudFile.of(tmp_path / "lidar.ply")
+    assert len(read.part) == 40 and any("12 points at exactly 0 0 0" in note for note in read.notes)
+
+
+@pytest.mark.parametrize("counts", ["uchar int", "ushort uint", "int int"])
+def test_a_mesh_in_ply_of_text_with_blank_lines_and_numbers_with_a_point(tmp_path, counts):
+    head = HEAD.format(4) + "property uchar red\nproperty uchar green\nproperty uchar blue\nelement face 2\n"
+    text = head + f"property uchar flags\nproperty list {counts} vertex_indices\n"
+    text += "property list uchar float texcoord\nend_header\n"
+    text += "0 0 0 255.0 0.0 0\n\n1 0 0 255.0 0 0\n1 1 0 255 0 0\n0 1 0 255 0 0\n\n"
+    text += "0 3 0 1 2 6 0 0 0 0 0 0\n\n0 3 0 2 3 6 0 0 0 0 0 0\n"
+    (tmp_path / "a.ply").write_text(text)
+    read = read_cloud(tmp_path / "a.ply")
+    assert np.allclose(read.normals, [0, 0, 1]) and (read.colors == [255, 0, 0]).all()
+    assert np.ptp(read.points, axis=0).round(2).tolist() == [1, 1, 0]
+
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+
+
+def halves(path):
+    """A picture whose left half is red, its right half blue."""
+    picture = np.zeros((8, 8, 3), np.uint8)
+    picture[:, :4, 0], picture[:, 4:, 2] = 255, 255
+    Image.fromarray(picture).save(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "picture", "material"),
+    [
+        ("f 1/1 2/2 3/3 \\\n4/4", "t.png", "map_Kd t.png"),
+        ("f 1/1 2/2 3/3 4/4 # wall", "t.png", "MAP_KD C:\\Bilder\\T.PNG"),
+        ("f -4/-4 -3/-3 -2/-2 -1/-1", "t.tga", "map_Kd t.tga"),
+        ("f 1/1/1 2/2/2 3/3/3 4/4/4", "my t.png", 'map_Kd -o 0.0 -7.0 0.0 -clamp on "my t.png"'),
+    ],
+)
+@pytest.mark.parametrize("libraries", ["a.mtl b.mtl", "all of it.mtl"])
+def test_lines_of_obj_that_go_on_have_comments_or_name_files_elsewhere(tmp_path, line, picture, material, libraries):
+    halves(tmp_path / picture)
+    (tmp_path / "a.mtl").write_text("newmtl other\nKd 0 1 0 # green\n")
+    (tmp_path / ("b.mtl" if "b.mtl" in libraries else libraries)).write_text(f"newmtl m\n{material}\n")
+    (tmp_path / "a.obj").write_text(f"# mtllib none.mtl\nmtllib {libraries}\n{SQUARE}usemtl m\n{line}\nl 1 2\n")
+    read = read_cloud(tmp_path / "a.obj")
+    left = read.points[:, 0] < 0.49
+    assert (read.colors[left] == [255, 0, 0]).all() and (read.colors[read.points[:, 0] > 0.51] == [0, 0, 255]).all()
+
+
+def test_a_texture_is_scaled_and_moved_as_its_material_says(tmp_path):
+    halves(tmp_path / "t.png")
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd -s 2 1 1 -o 0.5 0 t.png\n")
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{SQUARE}usemtl m\nf 1/1 2/2 3/3 4/4\n")
+    read = read_cloud(tmp_path / "a.obj")
+    place = (2 * read.points[:, 0] + 0.5) % 1
+    inside = np.abs(place % 0.5 - 0.25) < 0.24
+    assert ((read.colors[:, 2] > 0) == (place > 0.5))[inside].all()
+
+
+def glb(path, change=lambda document: None, texture="PNG", uv=((0, 0), (1, 0), (1, 1), (0, 1))):
+    """A square in glTF's x and y with a picture whose left half is red; `change` edits its document."""
+    stream = io.BytesIO()
+    picture = np.zeros((8, 8, 3), np.uint8)
+    picture[:, :4, 0], picture[:, 4:, 2] = 255, 255
+    Image.fromarray(picture).save(stream, texture, **({"lossless": True} if texture == "WEBP" else {}))
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
+    file = stream.getvalue()
+    file += bytes(-len(file) % 4)
+    blobs = [corners, np.array(uv, "<f4"), np.array([0, 1, 2, 0, 2, 3], "<u4"), np.frombuffer(file, np.uint8)]
+    # For instances and for sparse accessors.
+    blobs += [np.array([[0, 0, 0], [5, 0, 0]], "<f4"), np.array([[0.0, 0, 0, 1]] * 2, "<f4"), np.array([2], "<u4")]
+    blobs.append(np.array([[3, 1, 0]], "<f4"))
+    starts = np.cumsum([0, *(blob.nbytes for blob in blobs)])
+    kinds = {"<f4": 5126, "<u4": 5125}
+    document = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        "textures": [{"source": 0}],
+        "images": [{"bufferView": 3, "mimeType": f"image/{texture.lower()}"}],
+        "bufferViews": [{"buffer": 0, "byteOffset": int(at), "byteLength": b.nbytes} for at, b in zip(starts, blobs)],
+        "accessors": [
+            {"bufferView": k, "componentType": kinds.get(b.dtype.str, 5121), "count": len(b),
+             "type": f"VEC{b.shape[1]}" if b.ndim > 1 else "SCALAR"}
+            for k, b in enumerate(blobs)
+        ],
+    }  # fmt: skip
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    blob = b"".join(blob.tobytes() for blob in blobs)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def sides(path):
+    """Of a square: mean x of its red and of its blue points, its normals and its extent."""
+    read = read_cloud(path)
+    red = read.colors[:, 0] > read.colors[:, 2]
+    return (
+        read.points[red][:, 0].mean(),
+        read.points[~red][:, 0].mean(),
+        read.normals.mean(0),
+        np.ptp(read.points, axis=0),
+    )
+
+
+def test_a_glb_whose_texture_is_webp_alone(tmp_path):
+    def change(document):
+        document["textures"] = [{"extensions": {"EXT_texture_webp": {"source": 0}}}]
+        document["extensionsUsed"] = ["EXT_texture_webp"]
+
+    glb(tmp_path / "a.glb", change, "WEBP")
+    assert sides(tmp_path / "a.glb")[:2] == pytest.approx([0.25, 0.75], abs=0.01)
+
+
+def test_a_texture_in_a_form_that_is_not_read_is_named_and_no_other_picture_is_taken(tmp_path, capsys):
+    def change(document):
+        document["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
+        document["extensionsUsed"] = document["extensionsRequired"] = ["KHR_texture_basisu"]
+
+    glb(tmp_path / "a.glb", change)
+    assert read_cloud(tmp_path / "a.glb").colors is None
+    said = capsys.readouterr().out
+    assert "uses KHR_texture_basisu, which is not read" in said and "cannot be read" in said
+
+
+@pytest.mark.parametrize(
+    ("transform", "ends"),
+    [({"offset": [0.5, 0]}, (0.75, 0.25)), ({"scale": [-1, 1]}, (0.75, 0.25)), ({"rotation": np.pi}, (0.75, 0.25))],
+)
+def test_a_texture_is_placed_by_its_transform(tmp_path, transform, ends):
+    def change(document):
+        texture = document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+        texture["extensions"] = {"KHR_texture_transform": transform}
+
+    glb(tmp_path / "a.glb", change)
+    assert sides(tmp_path / "a.glb")[:2] == pytest.approx(ends, abs=0.01)
+
+
+def test_a_further_set_of_texture_coordinates_is_the_one_that_a_material_names(tmp_path):
+    def change(document):
+        names = document["meshes"][0]["primitives"][0]["attributes"]
+        names["TEXCOORD_1"] = names.pop("TEXCOORD_0")
+        document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["texCoord"] = 1
+
+    glb(tmp_path / "a.glb", change)
+    assert sides(tmp_path / "a.glb")[:2] == pytest.approx([0.25, 0.75], abs=0.01)
+
+
+def test_a_mirrored_node_keeps_its_outside_and_its_texture(tmp_path):
+    glb(tmp_path / "a.glb", lambda document: document["nodes"][0].update(scale=[-1, 1, 1]))
+    red, blue, normal, _ = sides(tmp_path / "a.glb")
+    assert (red, blue) == pytest.approx([-0.25, -0.75], abs=0.01) and np.allclose(normal, [0, -1, 0])
+
+
+def test_instances_strips_fans_and_sparse_corners_of_glb(tmp_path):
+    def instances(document):
+        about = {"attributes": {"TRANSLATION": 4, "ROTATION": 5}}
+        document["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": about}
+
+    def fan(document):
+        primitive = document["meshes"][0]["primitives"][0]
+        primitive["mode"] = 6
+        del primitive["indices"]
+
+    def sparse(document):
+        about = {"count": 1, "indices": {"bufferView": 6, "componentType": 5125}, "values": {"bufferView": 7}}
+        document["accessors"][0]["sparse"] = about
+
+    for change, extent in ((instances, [6, 0, 1]), (fan, [1, 0, 1]), (sparse, [3, 0, 1])):
+        glb(tmp_path / "a.glb", change)
+        assert sides(tmp_path / "a.glb")[3] == pytest.approx(extent, abs=0.01), change
+    glb(tmp_path / "a.glb")
+    (tmp_path / "cut.glb").write_bytes((tmp_path / "a.glb").read_bytes()[:-9])
+    with pytest.raises(StageError, match="cut short: its last 9 bytes are missing"):
+        read_cloud(tmp_path / "cut.glb")
+
+
+def survey(path, keys=None, wkt=None):
+    """A LAS file with GeoTIFF keys (key -> code), or with WKT."""
+    las = laspy.LasData(laspy.LasHeader(point_format=1 if keys else 6, version="1.2" if keys else "1.4"))
+    las.header.scales, las.header.offsets = np.full(3, 0.001), [500_000, 4_500_000, 0]
+    las.x, las.y, las.z = (np.array(GRID * 6).T * np.linspace(1, 2, 240)) + [[500_000], [4_500_000], [0]]
+    if keys:
+        body = struct.pack("<4H", 1, 1, 0, len(keys)) + b"".join(
+            struct.pack("<4H", k, 0, 1, n) for k, n in keys.items()
+        )
+        record = GeoKeyDirectoryVlr()
+        record.parse_record_data(body)
+        las.header.vlrs.append(record)
+    elif wkt:
+        las.header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    las.write(str(path))
+
+
+@pytest.mark.parametrize(
+    ("keys", "code", "units"),
+    [
+        ({3072: 2260, 4096: 5703}, "EPSG:2260+5703", "US survey foot and metre"),
+        ({3072: 26918, 4096: 5703, 4099: 9003}, None, "US survey foot and metre"),
+        ({3072: 26918, 4099: 9002}, None, "foot and metre"),
+        ({3072: 26918, 4096: 5703}, "EPSG:26918+5703", None),
+        ({3072: 2260, 4099: 9002}, None, None),  # both feet: 2 parts in a million
+    ],
+)
+def test_heights_are_known_by_geotiff_keys_as_by_wkt(tmp_path, keys, code, units):
+    survey(tmp_path / "keys.las", keys)
+    found = pyproj.CRS.from_wkt(las_crs(tmp_path / "keys.las"))
+    assert mixed_units(found) == units
+    if code:
+        wanted = pyproj.CRS.from_user_input(code)
+        survey(tmp_path / "wkt.las", wkt=wanted.to_wkt("WKT1_GDAL"))
+        assert found.sub_crs_list == wanted.sub_crs_list
+        assert mixed_units(pyproj.CRS.from_wkt(las_crs(tmp_path / "wkt.las"))) == units
+
+
+def test_a_plane_counts_in_the_unit_that_its_keys_name(tmp_path):
+    survey(tmp_path / "feet.las", {3072: 26918, 3076: 9002})
+    found = pyproj.CRS.from_wkt(las_crs(tmp_path / "feet.las"))
+    at = np.array([[500_000 / 0.3048, 4_500_000 / 0.3048, 100.0]])
+    wanted = to_wgs84(pyproj.CRS("EPSG:26918"), at * 0.3048, "")
+    np.testing.assert_allclose(to_wgs84(found, at, ""), wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["metre", "m", "Meter"])
+def test_a_site_s_own_system_is_taken_as_such(tmp_path, name):
+    survey(tmp_path / "site.las", wkt=f'LOCAL_CS["works",UNIT["{name}",1.0],AXIS["E",EAST],AXIS["N",NORTH]]')
+    outputs = {"cloud": tmp_path / "a.ply", "report": tmp_path / "a.json", "georeference_json": tmp_path / "place.json"}
+    import_scene_cloud(source=tmp_path / "site.las", **outputs)
+    place = read_json(tmp_path / "place.json")
+    assert value(place, "length_unit") == "m" and "works" in value(place, "crs") and not has_place(value(place, "crs"))
+    with pytest.raises(StageError, match="works is a site's own system, which has no place on the earth"):
+        to_wgs84(pyproj.CRS.from_wkt(value(place, "crs")), np.zeros((1, 3)), "photos")
+
+
+@pytest.mark.parametrize(("at", "kind", "number"), [(100, "<I", 2**32 - 1), (107, "<I", 2**32 - 1), (105, "<H", 3)])
+def test_a_las_header_that_counts_more_than_there_is_is_refused_at_once(tmp_path, at, kind, number):
+    survey(tmp_path / "a.las", {3072: 26918})
+    content = bytearray((tmp_path / "a.las").read_bytes())
+    struct.pack_into(kind, content, at, number)
+    (tmp_path / "a.las").write_bytes(content)
+    with pytest.raises(StageError, match="counts more records than it holds|points are missing"):
+        list(columns_in_parts(tmp_path / "a.las")())
