@@ -10,8 +10,7 @@ from scenefuse.core.stage import atomic_file, value
 from scenefuse.core.transforms import Array, Sim3, rotation_between
 from scenefuse.report.page import document, figure, view_section
 from scenefuse.report.values import flatten, number
-from scenefuse.report.view import REMOVED, View, merge, thin, within
-from scenefuse.report.view_scene import VIEW_POINTS
+from scenefuse.report.view import REMOVED, VIEW_POINTS, View, merge, thin, within
 from scenefuse.two_clouds.complete import Completed
 
 # How far around the object the view shows the scene, over the object's diagonal.
