@@ -81,17 +81,16 @@ def fuse_depth_maps(
     stages = [read_json(path) for path in depth_json]
     print(f"fusing {len(maps)} depth maps by {_all(stages, 'backend')}", flush=True)
     sources = {name: photo["sources"] for stage in stages for name, photo in stage["photos"].items()}
-    fused, outvoted = _fuse(workspace, maps, neighbours(sources), settings, cloud)
+    fused, measured, left = _fuse(workspace, maps, neighbours(sources), settings, cloud)
     # COLMAP counts pixels, of which one photo may bring several; we count photos.
     agreed = fused[fused.fields["views"] >= settings.min_photos]
     if len(agreed) == 0:
         raise _no_points(settings)
     kept = agreed[near_others(agreed.points)]
     print(f"{len(kept)} points, {len(agreed) - len(kept)} outliers dropped", flush=True)
-    measured = sum(int((read_depth(_path(folder, "depth_maps", name)) > 0).sum()) for name, folder in maps.items())
     content = _report(kept, len(agreed) - len(kept), measured, stages, length_unit(georeference_json))
     write_tiled(cloud, lambda: [kept], len(kept), kept.points)
-    content |= {"depth_maps": quantity(len(maps), "1"), "outvoted_share": quantity(outvoted, "1")}
+    content |= {"depth_maps": quantity(len(maps), "1"), "outvoted_share": quantity(1 - left / max(measured, 1), "1")}
     write_json(report, content)
 
 
@@ -132,8 +131,8 @@ def _fuse(
     near: Mapping[str, list[str]],
     settings: DenseCloudSettings,
     beside: Path,
-) -> tuple[Cloud, float]:
-    """COLMAP's fusion of what is left of the maps after their vote, as a cloud with `views`; the share outvoted.
+) -> tuple[Cloud, int, int]:
+    """COLMAP's fusion of what is left of the maps after their vote, as a cloud with `views`; pixels before and after.
 
     Args:
         workspace: that the maps belong to.
@@ -167,7 +166,7 @@ def _fuse(
         if not path.is_file() or (fused is not None and fused.num_points3D() == 0 and path.stat().st_size < 1000):
             raise _no_points(settings)
         cloud, views = read_cloud(path), _read_visibility(path.with_suffix(".ply.vis"))
-    return Cloud(cloud.points, cloud.normals, cloud.colors, {"views": views}), 1 - left / max(measured, 1)
+    return Cloud(cloud.points, cloud.normals, cloud.colors, {"views": views}), measured, left
 
 
 def _options(settings: DenseCloudSettings, cached_bytes: int) -> pycolmap.StereoFusionOptions:

@@ -77,11 +77,13 @@ class DepthEstimate:
         depth: (H, W) float32 along z, in world units; 0 where there is none.
         normals: (H, W, 3) float32 unit normals in the camera frame, towards the camera; zeros where there is no depth.
         score: (H, W) float32, mean NCC of the best sources, -1..1.
+        best: (H, W) float32, the depth that matches best, where it is no measurement too.
     """
 
     depth: NDArray[np.float32]
     normals: NDArray[np.float32]
     score: NDArray[np.float32]
+    best: NDArray[np.float32]
 
 
 def estimate_depth(
@@ -114,8 +116,9 @@ def estimate_depth(
     normals = _normals(inverse, slopes, reference.intrinsics)
     pixel = (1 / near - 1 / far) / max(matcher.middle_shift_per_inverse_depth(1 / far, 1 / near), 1e-6)
     good = is_measured(matcher, inverse, score, settings.min_score, pixel) & (inverse > 0.5 / far)
-    depth = torch.where(good, 1 / inverse.clamp(min=1e-12), torch.zeros_like(inverse))
-    return DepthEstimate(depth.cpu().numpy(), (normals * good[..., None]).cpu().numpy(), score.cpu().numpy())
+    best = 1 / inverse.clamp(min=1e-12)
+    maps = torch.where(good, best, torch.zeros_like(best)), normals * good[..., None], score, best
+    return DepthEstimate(*(values.cpu().numpy() for values in maps))
 
 
 def refine_by_matching(

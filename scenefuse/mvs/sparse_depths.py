@@ -34,13 +34,13 @@ def own_points(views: Views) -> NDArray[np.bool_]:
     """(P,) which sparse points are the object's: on the masks of three photos, and of nearly all that observe them."""
     on, seen = np.zeros(len(views.sparse), np.int64), np.zeros(len(views.sparse), np.int64)
     for index in range(len(views.names)):
-        rows, on_mask, _ = _beside_mask(views, index, views.tracks[index])[:3]
+        rows, on_mask, _ = beside_mask(views, index, views.tracks[index])[:3]
         seen[rows] += 1
         on[rows[on_mask]] += 1
     return (on >= CONFIRMING_PHOTOS) & (on >= MIN_ON_MASK_SHARE * seen)
 
 
-def _beside_mask(
+def beside_mask(
     views: Views, index: int, rows: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_], Array, Array]:
     """Of sparse points, the rows of those in a photo's frame, which are on its mask, which clearly off it, their pixels
@@ -57,9 +57,9 @@ def _depths_of(views: Views, index: int, own: NDArray[np.bool_]) -> NDArray[np.f
     """The map (H, W) of one photo."""
     view = views.view(index)
     mask = views.masks[index, : view.height, : view.width]
-    _, on, off, exact, depth = _beside_mask(views, index, views.tracks[index])
+    _, on, off, exact, depth = beside_mask(views, index, views.tracks[index])
     unseen = np.setdiff1d(np.flatnonzero(own), views.tracks[index])
-    _, _, hidden, there, behind = _beside_mask(views, index, unseen)
+    _, _, hidden, there, behind = beside_mask(views, index, unseen)
     of_object = _interpolated(exact[on], 1 / depth[on], mask.shape)
     beside = _interpolated(
         np.concatenate([exact[off], there[hidden]]),

@@ -35,8 +35,7 @@ class Reference:
 def select_views(workspace: Workspace, sources: int, min_angle_deg: float) -> dict[str, Reference]:
     """Sources and depth range of every photo that has any, by name, from the sparse points.
 
-    A source's worth is the sum over shared points of a weight that falls off below 8 and above 25 degrees between the
-    two rays (in the manner of MVSNet's and COLMAP's view selection).
+    Sources are ranked by `pair_worth`.
 
     Args:
         workspace: posed photos and sparse points.
@@ -61,9 +60,9 @@ def select_views(workspace: Workspace, sources: int, min_angle_deg: float) -> di
             shared = np.intersect1d(seen[k], seen[j], assume_unique=True) if j != k else np.empty(0)
             if len(shared) < MIN_SHARED_POINTS:
                 continue
-            angles = _angles_deg(workspace.points[shared], view.centre, other.centre)
-            if np.median(angles) >= min_angle_deg:
-                worth.append((-float(_angle_weight(angles).sum()), j))
+            value, angle_deg = pair_worth(workspace.points[shared], view.centre, other.centre)
+            if angle_deg >= min_angle_deg:
+                worth.append((-value, j))
         if worth:
             chosen = [workspace.views[j] for _, j in sorted(worth)[:sources]]
             found[view.name] = Reference(view, chosen, *_depth_range(view, workspace.points[seen[k]]))
@@ -84,15 +83,18 @@ def _depth_range(view: View, points: Array) -> tuple[float, float]:
     return float(near), float(1.25 * np.percentile(z, 99))
 
 
-def _angles_deg(points: Array, a: Array, b: Array) -> Array:
-    """Angles (N,) between the rays from (N, 3) points to two camera centres."""
+def pair_worth(points: Array, a: Array, b: Array) -> tuple[float, float]:
+    """What matching two photos at a and b (3,) is worth, and the median angle between their rays to shared points.
+
+    The sum over the points (N, 3) of a weight that falls off below 8 and above 25 degrees, in the manner of MVSNet's
+    and COLMAP's view selection.
+    """
+    if len(points) == 0:
+        return 0.0, 0.0
     u, v = points - a, points - b
     cosine = (u * v).sum(1) / (np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1))
-    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-
-
-def _angle_weight(angles_deg: Array) -> Array:
-    """Worth of a point seen at these angles, (N,) in 0..1."""
+    angles = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     (low, high), (below, above) = GOOD_ANGLES_DEG, FALLOFF_DEG
-    width = np.where(angles_deg < low, below, np.where(angles_deg > high, above, 1.0))
-    return np.exp(-0.5 * ((angles_deg - np.clip(angles_deg, low, high)) / width) ** 2)
+    width = np.where(angles < low, below, np.where(angles > high, above, 1.0))
+    weight = np.exp(-0.5 * ((angles - np.clip(angles, low, high)) / width) ** 2)
+    return float(weight.sum()), float(np.median(angles))

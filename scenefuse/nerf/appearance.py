@@ -33,8 +33,8 @@ ROUNDS = 10
 GAIN_NEIGHBOURS = 2
 # Sharpness compares details finer than the first Gaussian's sigma with those between the two, in pixels.
 FINE_PX, COARSE_PX = 1.0, 3.0
-# A photo is compared with so many from nearby, and is blurred with less than this share of their median sharpness.
-SHARPNESS_NEIGHBOURS, MIN_SHARPNESS_SHARE = 8, 0.7
+# A photo is blurred with less than this share of the median sharpness of those that it is compared with.
+MIN_SHARPNESS_SHARE = 0.7
 
 
 @dataclass
@@ -229,7 +229,7 @@ def photo_weights(sharpness: Tensor, center: Tensor) -> Tensor:
     count = len(sharpness)
     if count < 2:
         return torch.ones(count)
-    share = sharpness / torch.quantile(sharpness[nearest(center, SHARPNESS_NEIGHBOURS)], 0.5, dim=1).clamp(min=1e-9)
+    share = sharpness / torch.quantile(sharpness[nearest(center, COMPARED_PHOTOS)], 0.5, dim=1).clamp(min=1e-9)
     return torch.where(share < MIN_SHARPNESS_SHARE, (share / MIN_SHARPNESS_SHARE) ** 2, torch.ones(count))
 
 

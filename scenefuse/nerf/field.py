@@ -10,8 +10,6 @@ from scenefuse.nerf.encoding import encode, hash_grid, spherical_harmonics
 
 # exp(11) in a unit cube is opaque within a ten-thousandth of its side; beyond it gradients overflow.
 MAX_LOG_DENSITY = 11.0
-# Training from coarse to fine begins with half of the levels, and with so many at least.
-MIN_OPEN_LEVELS = 4
 
 
 @dataclass(frozen=True)
@@ -73,12 +71,12 @@ class Field(nn.Module):
 
 
 def coarse_to_fine(field: Field, progress: float, finished: float) -> None:
-    """Open the levels one after the other: all of them once `progress` (0..1) reaches `finished`.
+    """Open the levels one after the other, from half of them to all once `progress` (0..1) reaches `finished`.
 
     The window is linear; Park et al. 2021 (Nerfies) and Lin et al. 2021 (BARF) use a cosine.
     """
     levels = field.settings.levels
-    first = max(MIN_OPEN_LEVELS, levels // 2)
+    first = levels // 2
     opened = levels if finished <= 0 else first + (levels - first) * progress / finished
     field.level_weight.copy_((opened - torch.arange(levels, device=field.level_weight.device)).clamp(0.0, 1.0))
 

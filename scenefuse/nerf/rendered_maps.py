@@ -22,14 +22,13 @@ from scenefuse.photos.views import Views
 
 Maps = NDArray[np.float32]
 
-# Views are rendered so far beyond their masks: what the object shows beyond them counts against it.
-BEYOND_MASK_PX = 4
+# Views are rendered so far beyond their masks: what the object shows beyond them counts against it. Windows of 11
+# pixels, in which structural similarity is measured, reach as far.
+BEYOND_MASK_PX = 5
 # A rendered depth counts where the ray is opaque and its weights lie within a few hundredths of the cube (method N13).
 MAX_DEVIATION = 0.05
 # Normals come from depths so many pixels apart, unless these jump: by more than this share, no slanted surface does.
 NORMAL_STEP_PX, DEPTH_JUMP = 2, 0.03
-# Structural similarity looks at windows of 11 pixels: these reach 5 beyond the mask.
-SSIM_REACH_PX = 5
 
 
 @dataclass(frozen=True)
@@ -175,29 +174,28 @@ def measure_quality(
     quality of the right half is given twice: as rendered, and with gains fitted to the left half, as in NeRF in the
     Wild (Martin-Brualla et al. 2021, section 5).
     """
-    rows, halves = [], []
+    rows = []
     for index in np.flatnonzero(measured):
-        mask = torch.from_numpy(views.masks[index])
+        mask, everything = torch.from_numpy(views.masks[index]), torch.from_numpy(~views.beyond[index])
         photo = torch.from_numpy(views.images[index]).float() / 255.0
-        picture, everything = rendered[index].color.clamp(0, 1), torch.from_numpy(~views.beyond[index])
+        picture = rendered[index].color.clamp(0, 1)
         masked = photo * (torch.from_numpy(views.mattes[index]) / 255.0 if exact else mask)[..., None]
-        near = dilate(mask[None], SSIM_REACH_PX)[0]
-        signal = psnr(picture, masked, mask), psnr(picture, masked, everything)
-        rows.append((*signal, ssim(picture, masked, near), silhouette_iou(rendered[index].opacity, mask)))
-        right = right_half(mask)
-        fitted = fitted_to_left_half(rendered[index].color, masked, mask).clamp(0, 1)
-        halves.append([rate(p, masked, right) for rate in (psnr, ssim) for p in (picture, fitted)])
-    inside, whole, structure, outline = np.mean(rows, axis=0)
-    half = np.mean(halves, axis=0)
+        right, fitted = right_half(mask), fitted_to_left_half(rendered[index].color, masked, mask).clamp(0, 1)
+        rows.append(
+            {
+                "psnr_held_out": psnr(picture, masked, mask),
+                "psnr_held_out_masked_photo": psnr(picture, masked, everything),
+                "ssim": ssim(picture, masked, dilate(mask[None], BEYOND_MASK_PX)[0]),
+                "psnr_right_half": psnr(picture, masked, right),
+                "psnr_right_half_fitted_on_left": psnr(fitted, masked, right),
+                "ssim_right_half": ssim(picture, masked, right),
+                "ssim_right_half_fitted_on_left": ssim(fitted, masked, right),
+                "silhouette_iou": silhouette_iou(rendered[index].opacity, mask),
+            }
+        )
+    unit = {True: "dB", False: "1"}
     return {
-        "psnr_held_out": quantity(float(inside), "dB"),
-        "psnr_held_out_masked_photo": quantity(float(whole), "dB"),
-        "ssim": quantity(float(structure), "1"),
-        "psnr_right_half": quantity(float(half[0]), "dB"),
-        "psnr_right_half_fitted_on_left": quantity(float(half[1]), "dB"),
-        "ssim_right_half": quantity(float(half[2]), "1"),
-        "ssim_right_half_fitted_on_left": quantity(float(half[3]), "1"),
-        "silhouette_iou": quantity(float(outline), "1"),
+        **{n: quantity(float(np.mean([row[n] for row in rows])), unit[n.startswith("psnr")]) for n in rows[0]},
         "measured_on": quantity("held-out photos" if views.held_out.any() else "training photos", ""),
         "photos_measured": quantity(int(measured.sum()), "1"),
     }

@@ -18,6 +18,7 @@ from scenefuse.geometry.visual_hull import (
     is_whole,
     least_framing,
 )
+from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.nerf.rays import dilate
 from scenefuse.photos.workspace import View
 
@@ -25,17 +26,15 @@ from scenefuse.photos.workspace import View
 FIRST_CELLS = 64
 # Share of the cube's side left free on each side of the hull, for what the masks cut off.
 MARGIN = 0.02
-# A mask of fewer pixels does not show where the object is.
-MIN_MASK_PIXELS = 16
 # Share of the photos that must frame a cell, more than masks need: what few photos bound is large, and costs rays.
 MIN_FRAMING_SHARE = 0.3
 # The first, rough cube is wider by this share on each side than the masks' extents ask for, or the object's own points.
 ROUGH_MARGIN = 0.25
 # Photos that show a cell, from which on one may miss it, however small the tolerance: a single mask may lack a part.
 TOLERANT_PHOTOS = 12
-# Photos that must have a cell on the mask, no deeper behind the surface than this share of the cube's side, where some
+# Three photos must have a cell on the mask, no deeper behind the surface than this share of the cube's side, where some
 # have it behind the surroundings: what lies behind these and the object is no part of it that one could see.
-MIN_OPEN_PHOTOS, MAX_DEPTH_BEHIND = 3, 0.05
+MAX_DEPTH_BEHIND = 0.05
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,7 @@ def cube_from_cameras(views: list[View]) -> Sim3:
     normal, right, centres, angles = np.zeros((3, 3)), np.zeros(3), [], []
     for view in views:
         rows, columns = np.nonzero(view.pixels)
-        if len(rows) < MIN_MASK_PIXELS:
+        if len(rows) == 0:
             continue
         # A few stray pixels of a mask do not count.
         box = np.percentile(columns, [0.5, 99.5]), np.percentile(rows, [0.5, 99.5])
@@ -207,7 +206,7 @@ def visual_hull(
         shown = found.shown + (found.hidden if count < size else 0)
         kept = (found.missed <= np.maximum(tolerance * shown, shown >= TOLERANT_PHOTOS)) & (shown >= quorum)
         if count == size:
-            kept &= (found.hidden == 0) | (found.open >= MIN_OPEN_PHOTOS)
+            kept &= (found.hidden == 0) | (found.open >= CONFIRMING_PHOTOS)
         cells = cells[kept]
         if count == size or len(cells) == 0:
             hull = np.zeros((size, size, size), dtype=bool)

@@ -229,7 +229,7 @@ class Stage:
         objective = monocular_losses(networks, self.frames, supervision, recipe)
         losses = optimise(networks.parts(), self.frames, objective, recipe, checkpoint, self.seed)
         raw = predict(networks.depth, self.frames, supervision.colors, supervision.first)
-        placed = place(raw, networks, self.frames, self.views, self.pose_source, self.seed)
+        placed = place(raw, networks, self.frames, self.views, self.pose_source)
         depth, known = placed.depth * placed.measured.masks, self.views.object_from_cam
         maps = depth[:, 0].cpu().numpy()
         with atomic_directory(self.outputs.stage) as folder:
@@ -238,7 +238,7 @@ class Stage:
         write_posed(self.workspace, self.outputs.posed, self.views, placed.poses)
         chain = chain_quantities(placed.chain, known, placed.poses, self.pose_source)
         write_json(self.outputs.posed_json, chain)
-        aligned = residual_at_checks(align_maps(placed.depth, placed.measured, 0), placed.measured)
+        aligned = residual_at_checks(align_maps(placed.depth, placed.measured), placed.measured)
         content |= {
             "steps": quantity(recipe.steps(self.frames), "1"),
             **{name: part for name, part in chain.items() if name not in ("frame", "up_in_camera_frame")},
@@ -254,9 +254,7 @@ class Stage:
         print(f"depth maps written: {value(content, 'consistent_share'):.0%} agree with another view", flush=True)
 
 
-def place(
-    raw: Tensor, networks: Networks, frames: DepthPhotos, views: Views, pose_source: PoseSource, seed: int
-) -> Placed:
+def place(raw: Tensor, networks: Networks, frames: DepthPhotos, views: Views, pose_source: PoseSource) -> Placed:
     """Depths (V, 1, H, W) and poses of the networks in the object's frame; errors as of `estimate_as_paper`."""
     chain = chained(networks.pose, frames)
     if pose_source == "chain":
@@ -265,7 +263,7 @@ def place(
         return Placed(chain, poses, raw * unit, unit, photos_at(poses, views, frames))
     known = photos_at(views.object_from_cam, views, frames)
     unit = median_ratio(raw, known)
-    return Placed(chain, views.object_from_cam, align_maps(raw * unit, known, seed), unit, known)
+    return Placed(chain, views.object_from_cam, align_maps(raw * unit, known), unit, known)
 
 
 def photos_at(poses: Array, views: Views, frames: DepthPhotos) -> DepthPhotos:

@@ -108,38 +108,22 @@ def load_networks(path: Path, device: torch.device) -> tuple[Networks, int, floa
 
 
 @torch.no_grad()
-def pose_quantities(network: PoseNetwork, photos: DepthPhotos, poses: np.ndarray) -> dict[str, Any]:
-    """The network's relative rotations and translations against those of (V, 4, 4) poses object_from_cam.
-
-    The same motion for all pairs tells nothing: beside the errors stand how far those found differ from their own mean,
-    and what the mean of the true ones leaves.
-    """
+def pose_quantities(network: PoseNetwork, photos: DepthPhotos, poses: Array) -> dict[str, Any]:
+    """The network's relative rotations and translations against those of (V, 4, 4) poses object_from_cam, and how far
+    these turn: the error of standing still."""
     small = small_photos(photos)
-    order = np.flatnonzero(photos.trained)
-    pairs = np.column_stack([order, photos.sources[order, 0].cpu().numpy()])
-    target, source = torch.as_tensor(pairs).T
+    target = torch.as_tensor(np.flatnonzero(photos.trained))
+    source = photos.sources[target, 0].cpu()
     found = network(small[target], small[source]).double().cpu().numpy()
-    true = np.linalg.inv(poses[pairs[:, 1]]) @ poses[pairs[:, 0]]
-    turns, true_turns = found[:, :3, :3], true[:, :3, :3]
+    true = np.linalg.inv(poses[source]) @ poses[target]
     off = np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1) / np.linalg.norm(true[:, :3, 3], axis=1)
+    apart, turns = found[:, :3, :3] @ true[:, :3, :3].swapaxes(1, 2), true[:, :3, :3]
+    error, to_find = (float(np.median([rotation_angle_deg(turn) for turn in of])) for of in (apart, turns))
     return {
-        "pose_network_rotation_error_deg": quantity(_apart_deg(turns, true_turns), "deg"),
-        "pose_network_rotation_to_find_deg": quantity(_apart_deg(true_turns, np.eye(3)), "deg"),
-        "pose_network_rotation_varies_deg": quantity(_apart_deg(turns, _mean(turns)), "deg"),
-        "rotation_error_of_one_motion_for_all_deg": quantity(_apart_deg(true_turns, _mean(true_turns)), "deg"),
+        "pose_network_rotation_error_deg": quantity(error, "deg"),
+        "pose_network_rotation_to_find_deg": quantity(to_find, "deg"),
         "pose_network_translation_error": quantity(float(np.median(off)), "1"),
     }
-
-
-def _apart_deg(turns: Array, others: Array) -> float:
-    """Median angle between rotations (N, 3, 3) and others, (N, 3, 3) or one (3, 3), in degrees."""
-    return float(np.median([rotation_angle_deg(turn) for turn in turns @ others.swapaxes(-1, -2)]))
-
-
-def _mean(turns: Array) -> Array:
-    """The rotation (3, 3) nearest to all of (N, 3, 3)."""
-    u, _, vt = np.linalg.svd(turns.sum(0))
-    return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)
 
 
 @dataclass(frozen=True)
@@ -188,7 +172,6 @@ def frames_of(views: Views, device: torch.device) -> DepthPhotos:
     frames = DepthPhotos(
         as_tensor(views.images).permute(0, 3, 1, 2).contiguous() / 255.0,
         as_tensor(views.masks)[:, None],
-        as_tensor(views.beyond)[:, None],
         as_tensor(views.intrinsics),
         torch.eye(4, device=device).repeat(count, 1, 1),
         ~views.held_out,

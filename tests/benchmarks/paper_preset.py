@@ -9,7 +9,7 @@ python tests/benchmarks/paper_preset.py --shipped results --chained paper/result
 Its rows of the paper's Tables 2 to 4 are those of results/summary/paper.tsv (scenefuse/paper/paper_tables.py); here
 are two runs of the preset side by side, and errors against the truth. Where a stage ended in an error, the table says
 so, and what follows is empty; without a truth, so are errors. `null` is what chance gives: one motion, a random one,
-from each frame to the next (`one motion for all`: the best one), depth that is the same all over a photo, a random
+from each frame to the next, depth that is the same all over a photo, a random
 cloud in the place of the object's points, in the shipped run's crop or, for a run of the preset, in its own.
 """
 
@@ -50,7 +50,6 @@ POSES = {
     TRAJECTORY: "trajectory_error_chain_over_extent",
     TURNED: "rotation_error_chain_deg",
     "rotation error of one motion (deg)": "pose_network_rotation_error_deg",
-    "how far one motion is from their mean (deg)": "pose_network_rotation_varies_deg",
     "shift error of one motion over its length": "pose_network_translation_error",
 }
 CHAINED, FROM_SFM, SHIPPED = "paper preset, chained poses", "paper preset, SfM's poses", SCENEFUSE
@@ -178,10 +177,9 @@ def of_chance_in_stages(shipped: Run, chained: Run) -> dict[str, Any]:
     rows: dict[str, Any] = {}
     if (chained.folder / "stage1.json").is_file():
         report = read_json(chained.folder / "stage1.json")
-        still, same = "pose_network_rotation_to_find_deg", "rotation_error_of_one_motion_for_all_deg"
         for number in (1, 3):
-            rows[f"rotation error of one motion (deg), stage {number}"] = value(report, still)
-            rows[f"one motion for all: its error (deg), stage {number}"] = value(report, same)
+            still = value(report, "pose_network_rotation_to_find_deg")
+            rows[f"rotation error of one motion (deg), stage {number}"] = still
     known = np.stack([view.world_from_cam for view in read_workspace(shipped.folder / "undistorted").views])
     repeated = one_motion_repeated(known, shipped.seed)
     rows |= {f"{name}, stage {number}": error for name, error in repeated.items() for number in (1, 3)}

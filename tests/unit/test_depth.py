@@ -9,12 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from support.textured_plane import plane_views
+from support.textured_plane import plane_views, speckled
 
 from scenefuse.core.stage import StageError
 from scenefuse.nerf.prior import train_depth as stage
-from scenefuse.nerf.prior.first_depth import network_inputs
-from scenefuse.nerf.prior.inputs import depth_photos
+from scenefuse.nerf.prior.inputs import depth_photos, network_inputs
 from scenefuse.nerf.prior.monodepth import (
     DepthNetwork,
     depth_from_disparity,
@@ -136,17 +135,17 @@ def test_first_disparity_is_near_the_truth_and_sources_are_never_held_out():
     views, truth = plane_views()
     photos = depth_photos(views, 4, torch.device("cpu"))
     assert not np.isin(np.flatnonzero(views.held_out), photos.sources.numpy()).any()
-    first = network_inputs(photos, 16).first
+    first = network_inputs(photos).first
     depth = depth_from_disparity(first, photos.near, photos.far).numpy()[:, 0]
     error = np.abs(depth - truth)[views.masks] / photos.diagonal
     assert np.median(error) < 0.005
 
 
-def test_the_plane_sweep_alone_is_near_the_truth():
-    views, truth = plane_views(width=128, height=96)
-    photos = depth_photos(views, 4, torch.device("cpu"))
-    swept = (network_inputs(photos, 24).channels[:, -2:-1] + 1) / 2
-    depth = depth_from_disparity(swept, photos.near, photos.far).numpy()[:, 0]
+def test_stereo_alone_is_near_the_truth():
+    views, truth = plane_views(width=160, height=120)
+    photos = depth_photos(speckled(views, truth), 4, torch.device("cpu"))
+    channels = network_inputs(photos).channels
+    depth = depth_from_disparity((channels[:, -2:-1] + 1) / 2, photos.near, photos.far).numpy()[:, 0]
     error = np.abs(depth - truth)[views.masks] / photos.diagonal
     assert np.median(error) < 0.003
 
@@ -156,7 +155,7 @@ RECIPE = Recipe(epochs=3, warmup_epochs=1, batch_photos=4)
 
 def _train(checkpoint, photos, stop_at=None):
     """A trained network and its losses; a SIGTERM comes in step `stop_at`."""
-    inputs = network_inputs(photos, 0)
+    inputs = network_inputs(photos, None)
     torch.manual_seed(0)
     network = DepthNetwork(inputs.channels.shape[1])
     calls, original = iter(range(1000)), torch.optim.Adam.step
@@ -186,7 +185,7 @@ def uninterrupted(tmp_path_factory):
 def test_training_mends_a_wrong_first_depth(tmp_path):
     views, truth = plane_views(6)
     photos = depth_photos(views, 3, torch.device("cpu"))
-    inputs = network_inputs(photos, 0)
+    inputs = network_inputs(photos, None)
     torch.manual_seed(0)
     network, wrong = DepthNetwork(inputs.channels.shape[1]), replace(inputs, first=inputs.first * 0.7)
 
@@ -261,7 +260,7 @@ def test_a_checkpoint_of_other_inputs_is_not_resumed(tmp_path, monkeypatch, what
     def killed(self, *args):
         raise SystemExit(143)
 
-    monkeypatch.setattr(stage, "SWEEP_PLANES", 0)
+    monkeypatch.setattr(stage, "network_inputs", lambda photos: network_inputs(photos, None))
 
     def keys(views):
         monkeypatch.setattr(stage, "load_views", lambda *_: views)

@@ -228,7 +228,7 @@ def test_depth_gets_the_unit_of_the_poses_that_go_on(source):
     motions = torch.as_tensor(np.linalg.inv(unit[1:]) @ unit[:-1])
     told = replace(networks, pose=Known(motions))
     raw = torch.tensor(np.where(truth > 0, truth, 3.0) / 3.0, dtype=torch.float32)[:, None]
-    placed = place(raw, told, frames, views, source, 0)
+    placed = place(raw, told, frames, views, source)
     assert placed.unit == pytest.approx(3.0, rel=0.02)
     on_object = torch.from_numpy(views.masks)[:, None]
     assert np.allclose(placed.depth[on_object].numpy(), truth[views.masks], rtol=0.02)

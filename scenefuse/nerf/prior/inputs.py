@@ -1,4 +1,7 @@
-"""The photos of an object, cut to it and as tensors: depth range, photos to compare with, SfM points."""
+"""Stage 1's photos, cut to the object and as tensors, and the depth that its network starts from.
+
+First depths lie between SfM points, and are measured by stereo (M7).
+"""
 
 from dataclasses import dataclass, replace
 
@@ -6,31 +9,33 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from scenefuse.core.stage import StageError
-from scenefuse.mvs.photo_refinement import BEST_ANGLE_DEG
+from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
+from scenefuse.mvs.sparse_depths import beside_mask, own_points
+from scenefuse.mvs.view_selection import pair_worth
+from scenefuse.nerf.prior.monodepth import disparity_from_depth, points_in_cam
 from scenefuse.photos.views import Views
+from scenefuse.photos.workspace import View
 
 # Every tenth SfM point is kept from training, to measure with.
 CHECK_EVERY = 10
-# A point belongs to the object when this share of the photos that observe it have it in their mask.
-MIN_IN_MASKS_SHARE = 0.7
-# The depth range spans these percentiles of the points' depths, widened at both ends by a share of the range; the box
-# around the object spans the percentiles of BOX_PERCENTILES.
-DEPTH_PERCENTILES, BOX_PERCENTILES = (1, 99), (2, 98)
+# Depth range and box around the object span these percentiles of the points.
+PERCENTILES = (1, 99)
+# The depth range is widened at both ends by this share of it.
 RANGE_MARGIN = 0.15
 # Kept around a mask's box, share of the box: windows and warps at the outline need pixels beyond it.
 MARGIN = 0.06
-# The canvas fits the boxes of this percentage of the photos with some pixels to spare; larger ones are shrunk.
-FITTING_PERCENT = 90
+# The network halves its maps four times.
 MIN_CANVAS_PX = 32
-# Sides of the canvas relative to each other: no more elongated than this.
-MAX_ASPECT = 2.0
-# A pixel of a moved map has a depth when at least this share of what it is made of has one; it is interpolated unless
-# that differs from the nearest depth by more than this share, as at an edge.
-MIN_KNOWN_SHARE, EDGE_JUMP = 0.3, 0.02
+# As for a scene's photos (M7), with smaller windows, because the cut photos are small.
+STEREO = DepthMapSettings(sources=6, best_sources=2, window_px=5)
+# Matching score at which stereo and SfM points count the same.
+EVEN_SCORE = 0.3
+# SfM points that a pixel takes its disparity from, and that a point is held against to find outliers.
+NEAREST_POINTS = 8
 Map = NDArray[np.float32]
 
 
@@ -39,7 +44,7 @@ class Crops:
     """The photos cut out around their masks, all on canvases of one size.
 
     Attributes:
-        views: the cut photos with intrinsics to match; each begins anywhere on its canvas, so `sizes` say nothing.
+        views: the cut photos with intrinsics to match; beyond a photo, its border is repeated.
         crop_from_photo: (V, 2, 3) affine maps between pixels with centres at +0.5.
         masks: (V, H, W) bool, the masks of the whole photos.
         sizes: (V, 2) rows and columns of the whole photos (`Views.sizes`).
@@ -52,9 +57,11 @@ class Crops:
 
     def paste(self, index: int, on_canvas: Map) -> Map:
         """(h, w) map of the whole photo from the one on photo `index`'s canvas; 0 off the object."""
-        height, width = self.sizes[index]
-        mask = self.masks[index, :height, :width]
-        return _moved(on_canvas, cv2.invertAffineTransform(self.crop_from_photo[index]), mask.shape) * mask
+        height, width = self.sizes[index].tolist()
+        move = cv2.invertAffineTransform(self.crop_from_photo[index])
+        move[:, 2] += 0.5 * move[:, :2].sum(1) - 0.5  # OpenCV has pixel centres at integers
+        photo = cv2.warpAffine(on_canvas, move, (width, height), borderMode=cv2.BORDER_REPLICATE)
+        return photo * self.masks[index, :height, :width]
 
 
 def crop_to_object(views: Views, crop_px: int) -> Crops:
@@ -66,26 +73,28 @@ def crop_to_object(views: Views, crop_px: int) -> Crops:
     height, width = views.masks.shape[1:]
     boxes = np.array([_box(mask) for mask in views.masks])
     extent = (boxes[:, 2:] - boxes[:, :2]) * (1 + 2 * MARGIN)
-    aspect = float(np.clip(np.median(extent[:, 0] / extent[:, 1]), 1 / MAX_ASPECT, MAX_ASPECT))
+    aspect = float(np.median(extent[:, 0] / extent[:, 1]))
     ideal = np.array([crop_px * aspect**0.5, crop_px / aspect**0.5])
-    largest = np.minimum(np.minimum(ideal, np.percentile(extent, FITTING_PERCENT, axis=0) + 8), [width, height])
-    canvas = np.maximum(np.round(largest / 4) * 4, MIN_CANVAS_PX).astype(int)
-    wholes = {"images": views.images, "mattes": views.mattes, "known": (~views.beyond).astype(np.uint8)}
-    parts: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in wholes}
-    intrinsics, moves = [], []
+    largest = np.minimum(np.minimum(ideal, extent.max(0)), [width, height])
+    canvas = np.maximum(np.ceil(largest / 4) * 4, MIN_CANVAS_PX).astype(int)
+    images, mattes, intrinsics, moves = [], [], [], []
     for index, box in enumerate(boxes):
         shrink = min(1.0, *(canvas / extent[index]))
         size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
         scale = np.array(size) / [width, height]
         corner = np.round((box[:2] + box[2:]) / 2 * scale - canvas / 2).astype(int)
         move = np.column_stack([np.diag(scale), -corner])
-        for name, whole in wholes.items():
-            smaller = cv2.resize(whole[index], size, interpolation=cv2.INTER_AREA)
-            parts[name].append(_window(smaller, corner, canvas))
+        for parts, whole in ((images, views.images), (mattes, views.mattes)):
+            parts.append(_window(cv2.resize(whole[index], size, interpolation=cv2.INTER_AREA), corner, canvas))
         intrinsics.append(np.vstack([move, [0, 0, 1]]) @ views.intrinsics[index])
         moves.append(move)
-    images, mattes, known = (np.stack(pictures) for pictures in parts.values())
-    cut = replace(views, images=images, mattes=mattes, beyond=known == 0, intrinsics=np.stack(intrinsics))
+    cut = replace(
+        views,
+        images=np.stack(images),
+        mattes=np.stack(mattes),
+        beyond=np.zeros((len(mattes), *mattes[0].shape), bool),
+        intrinsics=np.stack(intrinsics),
+    )
     return Crops(cut, np.stack(moves), views.masks, views.sizes)
 
 
@@ -99,31 +108,13 @@ def _box(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def _window(image: NDArray, corner: NDArray, canvas: NDArray) -> NDArray:
-    """The canvas (width, height) whose top left pixel is `corner` of the image; the border is repeated."""
+    """The canvas (width, height) whose top left pixel is `corner` of a photo, or of a matte, which is 0 beyond it."""
     (left, top), (width, height) = corner, canvas
     rows = np.clip(np.arange(top, top + height), 0, image.shape[0] - 1)
     columns = np.clip(np.arange(left, left + width), 0, image.shape[1] - 1)
     inside = (rows == np.arange(top, top + height))[:, None] & (columns == np.arange(left, left + width))
     window = image[rows][:, columns]
     return window if image.ndim == 3 else np.where(inside, window, 0)
-
-
-def _moved(source: Map, target_from_source: NDArray[np.float64], size: tuple[int, ...]) -> Map:
-    """A map with holes (0) on another raster: bilinear between valid pixels, nearest where they differ much."""
-    inverse = cv2.invertAffineTransform(target_from_source)
-    v, u = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5, indexing="ij")
-    x, y = np.einsum("ij,jhw->ihw", inverse, np.stack([u, v, np.ones_like(u)])).astype(np.float32) - 0.5
-    valid = (source > 0).astype(np.float32)
-    share = _remap(valid, x, y, cv2.INTER_LINEAR)
-    smooth = _remap(source, x, y, cv2.INTER_LINEAR) / np.maximum(share, 1e-6)
-    nearest = _remap(source, x, y, cv2.INTER_NEAREST)
-    edge = (nearest > 0) & (np.abs(smooth - nearest) > EDGE_JUMP * nearest)
-    return np.where(share > MIN_KNOWN_SHARE, np.where(edge, nearest, smooth), 0.0).astype(np.float32)
-
-
-def _remap(source: Map, x: Map, y: Map, interpolation: int) -> Map:
-    moved = cv2.remap(source, x, y, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    return np.asarray(moved, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -133,7 +124,6 @@ class DepthPhotos:
     Attributes:
         images: (V, 3, H, W) in 0..1.
         masks: (V, 1, H, W) zeros and ones.
-        beyond: (V, 1, H, W) ones beyond the photo's border, where nothing is known.
         intrinsics: (V, 3, 3).
         object_from_cam: (V, 4, 4).
         trained: (V,) bool, False for held-out photos.
@@ -147,7 +137,6 @@ class DepthPhotos:
 
     images: Tensor
     masks: Tensor
-    beyond: Tensor
     intrinsics: Tensor
     object_from_cam: Tensor
     trained: NDArray[np.bool_]
@@ -181,9 +170,9 @@ def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhoto
             f"only {len(on_object)} SfM points lie on the object in all photos; depth needs at least 8: "
             "check that the masks show the object, and that the photos are sharp"
         )
-    low, high = np.percentile(views.sparse[on_object], BOX_PERCENTILES, axis=0)
+    low, high = np.percentile(views.sparse[on_object], PERCENTILES, axis=0)
     depths = np.concatenate([pixels[:, 2] for _, pixels in seen])
-    closest, farthest = np.percentile(depths, DEPTH_PERCENTILES)
+    closest, farthest = np.percentile(depths, PERCENTILES)
     margin = RANGE_MARGIN * (farthest - closest) + 1e-3 * farthest  # a range of its own where all depths are equal
 
     def as_tensor(array: NDArray[np.generic]) -> Tensor:
@@ -192,7 +181,6 @@ def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhoto
     return DepthPhotos(
         as_tensor(views.images).permute(0, 3, 1, 2).contiguous() / 255.0,
         as_tensor(views.masks)[:, None],
-        as_tensor(views.beyond)[:, None],
         as_tensor(views.intrinsics),
         as_tensor(views.object_from_cam),
         ~views.held_out,
@@ -206,45 +194,98 @@ def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhoto
 
 
 def _points_on_object(views: Views) -> list[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-    """For each photo the SfM points it observes on the object, as `_observed`.
-
-    A point belongs to the object when most photos that observe it have it in their mask: masks are a pixel or two wide
-    of the outline, and a point far behind the object must not widen the depth range.
-    """
-    seen = [_observed(views, index) for index in range(len(views.names))]
-    votes = np.zeros((2, len(views.sparse)), dtype=np.int64)
-    for (ids, _), track in zip(seen, views.tracks):
-        votes[0, ids] += 1
-        votes[1, track] += 1
-    belongs = votes[0] > MIN_IN_MASKS_SHARE * votes[1]
-    return [(ids[belongs[ids]], pixels[belongs[ids]]) for ids, pixels in seen]
-
-
-def _observed(views: Views, index: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Indices of the SfM points that photo `index` observes on the object, and their column, row and depth."""
-    ids = views.tracks[index]
-    pixels, depths = views.view(index).project(views.sparse[ids])
-    in_front = depths > 1e-6
-    ids, pixels, depths = ids[in_front], pixels[in_front], depths[in_front]
-    height, width = views.masks.shape[1:]
-    column, row = np.floor(pixels).astype(int).T
-    keep = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    keep[keep] = views.masks[index][row[keep], column[keep]]
-    return ids[keep], np.column_stack([pixels, depths])[keep].astype(np.float32)
+    """For each photo the SfM points of the object that it observes in its mask, and their column, row and depth."""
+    own, seen = own_points(views), []
+    for index, track in enumerate(views.tracks):
+        rows, on_mask, _, pixels, depth = beside_mask(views, index, track)
+        kept = on_mask & own[rows]
+        seen.append((rows[kept], np.column_stack([pixels, depth])[kept].astype(np.float32)))
+    return seen
 
 
 def _choose_sources(views: Views, seen: list[NDArray[np.int64]], count: int) -> NDArray[np.int64]:
-    """For each photo the best others: many shared points, seen under about 15 degrees (after MVSNet's pair score)."""
-    centres = views.object_from_cam[:, :3, 3]
-    middle = np.median(views.sparse[np.unique(np.concatenate(seen))], axis=0)
-    rays = centres - middle
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    angle = np.degrees(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)))
-    photo = np.repeat(np.arange(len(seen)), [len(ids) for ids in seen])
-    observed = csr_matrix((np.ones(len(photo)), (photo, np.concatenate(seen))), shape=(len(seen), len(views.sparse)))
-    shared = (observed @ observed.T).toarray()
-    score = (shared + 1.0) * np.exp(-(((angle - BEST_ANGLE_DEG) / BEST_ANGLE_DEG) ** 2))
-    score[:, views.held_out] = -1.0
-    np.fill_diagonal(score, -2.0)
+    """For each photo the best others to match it with: many shared points, seen under good angles."""
+    centres, photos = views.object_from_cam[:, :3, 3], range(len(seen))
+    shared = [[np.intersect1d(seen[k], seen[j], assume_unique=True) for j in photos] for k in photos]
+    worth = np.array(
+        [[pair_worth(views.sparse[shared[k][j]], centres[k], centres[j])[0] for j in photos] for k in photos]
+    )
+    worth[:, views.held_out] = -1.0
+    np.fill_diagonal(worth, -2.0)
     available = int((~views.held_out).sum()) - 1
-    return np.argsort(-score, axis=1, kind="stable")[:, : min(count, available)]
+    return np.argsort(-worth, axis=1, kind="stable")[:, : min(count, available)]
+
+
+@dataclass(frozen=True)
+class NetworkInputs:
+    """What the depth network is given of V photos.
+
+    Attributes:
+        channels: (V, 9, H, W): colour (3), mask, ray (2), disparity between SfM points, disparity by stereo, its score.
+        first: (V, 1, H, W) disparity that the network corrects.
+        between_points: (V, 1, H, W) disparity interpolated between SfM points alone.
+    """
+
+    channels: Tensor
+    first: Tensor
+    between_points: Tensor
+
+
+def network_inputs(photos: DepthPhotos, settings: DepthMapSettings | None = STEREO) -> NetworkInputs:
+    """The network's input channels and the disparity it starts from.
+
+    Args:
+        photos: the photos.
+        settings: of the stereo; None leaves it out.
+    """
+    count, _, height, width = photos.images.shape
+    flat = torch.full((count, 1, height, width), 0.5, device=photos.images.device)
+    ray = points_in_cam(torch.ones_like(flat), photos.intrinsics)[:, :2].view(count, 2, height, width)
+    between = torch.cat([_between_points(photos, index) for index in range(count)])
+    swept, score = flat, torch.zeros_like(flat)
+    if settings is not None:
+        pairs = [_swept(photos, index, settings) for index in range(count)]
+        swept, score = torch.cat([d for d, _ in pairs]), torch.cat([s for _, s in pairs])
+    weight = (score**4) / (score**4 + EVEN_SCORE**4)
+    first = between + weight * (swept - between)
+    colour = (photos.images * 2.0 - 1.0) * photos.masks
+    channels = torch.cat([colour, photos.masks * 2 - 1, ray, between * 2 - 1, swept * 2 - 1, score], 1)
+    return NetworkInputs(channels, first, between)
+
+
+def _between_points(photos: DepthPhotos, index: int) -> Tensor:
+    """(1, 1, H, W) disparity: inverse-distance mean of the nearest SfM points, with outliers left out."""
+    height, width = photos.images.shape[2:]
+    points = photos.points[index]
+    if len(points) < 3:
+        middle = np.median(np.concatenate([p[:, 2] for p in photos.points]))
+        points = np.array([[width / 2, height / 2, middle]], dtype=np.float32)
+    disparity = disparity_from_depth(torch.from_numpy(points[:, 2]), photos.near, photos.far).numpy()
+    tree = cKDTree(points[:, :2])
+    around = disparity[tree.query(points[:, :2], min(NEAREST_POINTS, len(points)))[1].reshape(len(points), -1)]
+    off = np.abs(disparity - np.median(around, axis=1))
+    keep = off <= 4.0 * np.median(off) + 0.02
+    rows, columns = np.indices((height, width)).reshape(2, -1) + 0.5
+    near_by = min(NEAREST_POINTS, int(keep.sum()))
+    distance, neighbour = cKDTree(points[keep, :2]).query(np.column_stack([columns, rows]), near_by)
+    distance, neighbour = distance.reshape(-1, near_by), neighbour.reshape(-1, near_by)
+    weight = 1.0 / (distance**2 + 1.0)
+    value = (disparity[keep][neighbour] * weight).sum(1) / weight.sum(1)
+    return torch.from_numpy(value.astype(np.float32)).view(1, 1, height, width).to(photos.images.device)
+
+
+def _swept(photos: DepthPhotos, index: int, settings: DepthMapSettings) -> tuple[Tensor, Tensor]:
+    """(1, 1, H, W) disparity by stereo and its score in 0..1."""
+    device = photos.images.device
+    reference, *sources = (_gray(photos, row) for row in (index, *photos.sources[index][: settings.sources].tolist()))
+    found = estimate_depth(reference, sources, photos.near, photos.far, settings, str(device))
+    depth, score = (torch.from_numpy(maps)[None, None].to(device) for maps in (found.best, found.score))
+    return disparity_from_depth(depth, photos.near, photos.far), score.clamp(0.0, 1.0)
+
+
+def _gray(photos: DepthPhotos, index: int) -> View:
+    """A photo in grey."""
+    pixels = photos.images[index].mean(0).cpu().numpy()
+    intrinsics = photos.intrinsics[index].double().cpu().numpy()
+    pose = np.linalg.inv(photos.object_from_cam[index].double().cpu().numpy())
+    return View(str(index), intrinsics, pose, pixels.shape[1], pixels.shape[0], pixels)

@@ -1,7 +1,7 @@
 """A small depth network and the signal that trains it without depth, after Monodepth2 (Godard et al., ICCV 2019).
 
 The network is trained from scratch on the photos of one object, so it is far smaller than the original's ResNet-18, and
-it corrects a first disparity (from SfM points and a plane sweep) instead of inventing one from colour alone, much as
+it corrects a first disparity (from SfM points and stereo) instead of inventing one from colour alone, much as
 ManyDepth (Watson et al., CVPR 2021) gives its network a cost volume. Its measure of depth is normalised disparity.
 
 One photo, warped by the right depth and pose, must look like another. For target photo I_t, source photos I_s, depth D

@@ -11,26 +11,20 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import siegelslopes
 from torch import Tensor
 
 from scenefuse.core.checkpoints import key_of
 from scenefuse.core.stage import atomic_directory, quantity, setting, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.nerf.prior.first_depth import NetworkInputs, network_inputs
-from scenefuse.nerf.prior.inputs import DepthPhotos, crop_to_object, depth_photos
+from scenefuse.nerf.prior.inputs import STEREO, DepthPhotos, NetworkInputs, crop_to_object, depth_photos, network_inputs
 from scenefuse.nerf.prior.monodepth import DepthNetwork, depth_from_disparity, parameters, sample
 from scenefuse.nerf.prior.refine_depth import MAP_AGREEMENT, confirm, write_prior
 from scenefuse.nerf.prior.training import Recipe, loss_quantities, predict, prepare_torch, train_network
 from scenefuse.photos.views import load_views
 
-# Other photos that each photo is compared with.
-SOURCES = 6
-# Depth hypotheses of the plane sweep that feeds the network.
-SWEEP_PLANES = 48
-# RANSAC of the alignment: draws, the smallest distance of two points as a share of their range, and the largest factor
-# between a draw's scale and the median ratio.
-DRAWS, MIN_DISTANCE_SHARE, MAX_SCALE_FACTOR = 200, 0.1, 5.0
+# Points that fix the scale and shift of a map.
 MIN_POINTS = 5
 
 Content = dict[str, Any]
@@ -65,7 +59,7 @@ def train_depth(
     """Train the depth network on one object's photos and write a depth map for each photo.
 
     Network and losses are those of Monodepth2 (method N10), trained from scratch. The network corrects a first
-    disparity made of sparse points and a plane sweep. Depth maps are along z, in object units, aligned to the sparse
+    disparity made of sparse points and stereo. Depth maps are along z, in object units, aligned to the sparse
     points of their photo by a robust scale and shift (N1), moved to where photos match (N13), 0 off the object.
 
     Args:
@@ -88,15 +82,15 @@ def train_depth(
     device = prepare_torch(seed)
     views = load_views(workspace, masks, width_px, hold_out_every)
     crops = crop_to_object(views, settings.crop_px)
-    photos = depth_photos(crops.views, SOURCES, device)
-    inputs = network_inputs(photos, SWEEP_PLANES)
+    photos = depth_photos(crops.views, STEREO.sources, device)
+    inputs = network_inputs(photos)
     print(f"{len(photos.points)} photos, depth {photos.near:.4g} to {photos.far:.4g}, inputs ready", flush=True)
     network = DepthNetwork(inputs.channels.shape[1]).to(device)
     recipe = Recipe(settings.epochs)
     checkpoint = checkpoints / key_of("stage 1", recipe, seed, photos, inputs) / "state.pt"
     losses = train_network(network, photos, inputs, recipe, checkpoint, seed)
     raw = predict(network, photos, inputs.channels, inputs.first)
-    aligned = align_maps(raw, photos, seed)
+    aligned = align_maps(raw, photos)
     depths = np.zeros(views.masks.shape, np.float32)
     for index, place in enumerate(depths):
         height, width = views.sizes[index]
@@ -142,51 +136,39 @@ def _print_quality(content: Content) -> None:
     print(f"depth maps written: {known}, {share:.0%} of the object confirmed by other views", flush=True)
 
 
-def align_maps(raw: Tensor, photos: DepthPhotos, seed: int) -> Tensor:
+def align_maps(raw: Tensor, photos: DepthPhotos) -> Tensor:
     """Each (1, H, W) depth map aligned to the SfM points of its photo, never to those kept for checking."""
     aligned = []
     for index, points in enumerate(photos.points):
         pixels = torch.from_numpy(points[None, :, :2]).to(raw.device)
         predicted = sample(raw[index : index + 1], pixels)[0, 0].double().cpu().numpy()
-        scale, shift = align_to_points(predicted, points[:, 2].astype(np.float64), seed)
+        scale, shift = align_to_points(predicted, points[:, 2].astype(np.float64))
         aligned.append((scale * raw[index] + shift).clamp_min(1e-3 * photos.near))
     return torch.stack(aligned)
 
 
-def align_to_points(predicted: Array, measured: Array, seed: int = 0) -> tuple[float, float]:
+def align_to_points(predicted: Array, measured: Array) -> tuple[float, float]:
     """Robust (scale, shift) with measured = scale * predicted + shift; 30 % and more outliers do no harm.
 
-    RANSAC over pairs scored by the median residual, then Tukey-weighted least squares. The shift is used, and the
-    scale differs from one, only where each lowers the median residual by more than its sampling error, 1 / sqrt(N):
-    with few points the depth map itself is the better evidence (method N1).
+    Repeated medians (Siegel 1982). The shift is used, and the scale differs from one, only where each lowers the median
+    residual by more than its sampling error, 1 / sqrt(N): with few points the depth map itself is the better evidence
+    (method N1).
 
     Args:
         predicted: (N,) depths of the map at SfM points.
         measured: (N,) depths of those points.
-        seed: of the RANSAC pairs.
     """
-    predicted, measured = np.asarray(predicted, float), np.asarray(measured, float)
     if len(predicted) < MIN_POINTS:
         return 1.0, 0.0
-    rng = np.random.default_rng(seed)
 
     def cost(scale: float, shift: float, free: int) -> float:
         residual = np.median(np.abs(scale * predicted + shift - measured))
         return float(residual) * (1.0 + free / np.sqrt(len(predicted)))
 
     scale = float(np.median(measured / predicted))
-    best = (scale, 0.0)
-    for _ in range(DRAWS):
-        i, j = rng.choice(len(predicted), 2, replace=False)
-        if abs(predicted[i] - predicted[j]) < MIN_DISTANCE_SHARE * np.ptp(predicted):
-            continue
-        slope = (measured[i] - measured[j]) / (predicted[i] - predicted[j])
-        candidate = (slope, measured[i] - slope * predicted[i])
-        if scale / MAX_SCALE_FACTOR < slope < MAX_SCALE_FACTOR * scale and cost(*candidate, 0) < cost(*best, 0):
-            best = candidate
-    best = _tukey_line(predicted, measured, *best)
-    options = [(cost(1.0, 0.0, 0), (1.0, 0.0)), (cost(scale, 0.0, 1), (scale, 0.0)), (cost(*best, 2), best)]
-    return min(options)[1]
+    line = siegelslopes(measured, predicted)
+    options = (1.0, 0.0), (scale, 0.0), (float(line.slope), float(line.intercept))
+    return min(options, key=lambda option: cost(*option, options.index(option)))
 
 
 def residuals_at_points(depth: Tensor, points: list[NDArray[np.float32]]) -> list[Array]:
@@ -202,17 +184,3 @@ def residual_at_checks(depth: Tensor, photos: DepthPhotos) -> float | None:
     """Median relative residual at the SfM points that no training saw; None where there are none."""
     residuals = np.concatenate(residuals_at_points(depth, photos.checks))
     return float(np.median(residuals)) if len(residuals) else None
-
-
-def _tukey_line(x: Array, y: Array, scale: float, shift: float) -> tuple[float, float]:
-    for _ in range(10):
-        residual = y - scale * x - shift
-        spread = 4.685 * max(1.4826 * float(np.median(np.abs(residual))), 1e-9 * float(np.median(np.abs(y))))
-        w = np.clip(1.0 - (residual / spread) ** 2, 0.0, None) ** 2
-        mean_x, mean_y = w @ x / w.sum(), w @ y / w.sum()
-        variance = w @ (x - mean_x) ** 2
-        if variance <= 1e-12 * max(mean_x**2, 1e-30):
-            break
-        scale = float(w @ ((x - mean_x) * (y - mean_y)) / variance)
-        shift = float(mean_y - scale * mean_x)
-    return scale, shift

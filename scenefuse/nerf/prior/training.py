@@ -20,8 +20,7 @@ from scenefuse.core.checkpoints import (
 )
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, threads
-from scenefuse.nerf.prior.first_depth import NetworkInputs
-from scenefuse.nerf.prior.inputs import DepthPhotos
+from scenefuse.nerf.prior.inputs import DepthPhotos, NetworkInputs
 from scenefuse.nerf.prior.monodepth import (
     DepthNetwork,
     depth_from_disparity,
@@ -215,7 +214,7 @@ def _anchor(depth: Tensor, points: Tensor, weights: Tensor) -> Tensor:
 def huber(relative: Tensor, largest: float) -> Tensor:
     """Absolute error, squared below SQUARED_ERROR and flat above `largest`."""
     size = relative.abs().clamp_max(largest)
-    return torch.where(size < SQUARED_ERROR, size**2 / (2 * SQUARED_ERROR), size - SQUARED_ERROR / 2)
+    return functional.huber_loss(size, torch.zeros_like(size), reduction="none", delta=SQUARED_ERROR) / SQUARED_ERROR
 
 
 def _padded(photos: DepthPhotos) -> tuple[Tensor, Tensor]:
