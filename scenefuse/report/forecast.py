@@ -35,7 +35,7 @@ MAP_READERS = ("refine_depth", "make_object_cloud", "fuse_object", "find_missing
 IDLE_FACTOR = 1.15
 # A forecast is right within this factor: what is short by more cannot do.
 ERROR_FACTOR = 1.5
-# Its file in the folder of the summary, and columns.
+# Its file in the folder of logs, and columns.
 FORECAST, COLUMNS = "forecast.tsv", ["benchmark", "seconds"]
 
 
