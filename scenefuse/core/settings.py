@@ -75,7 +75,7 @@ def read_differences(mine: Path) -> dict[str, Any]:
         own = yaml.safe_load(mine.read_text()) or {}
     except OSError:
         raise StageError(f"the settings file {mine} cannot be read; correct its path") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise StageError(f"{mine} is no YAML ({' '.join(str(error).split())}); correct it") from None
     if not isinstance(own, dict):
         raise StageError(f"{mine} holds no settings; write keys as in config/config.yaml, `registration:` first")

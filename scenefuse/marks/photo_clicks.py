@@ -14,7 +14,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.marks.clicks import Click, Clicks, in_photos
 from scenefuse.marks.triangulation import model_pixel
-from scenefuse.photos.workspace import View, posed_images, ray_through, read_model
+from scenefuse.photos.workspace import View, images_by_name, ray_through, read_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -90,7 +90,7 @@ def clicks_per_photo(
         StageError: a click outside its photo, a box that is not two corners, no click inside and no box in a photo with
             a camera.
     """
-    images = {image.name: image for image in posed_images(read_model(sparse))}
+    images = images_by_name(read_model(sparse))
     rows = {view.name: k for k, view in enumerate(views)}
     left_out: list[str] = []
     found: dict[int, list[tuple[Click, Array]]] = {}

@@ -11,7 +11,7 @@ import numpy as np
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.marks.clicks import Click, Clicks, ScenePoints, check_inside, in_photos, read_points
-from scenefuse.photos.workspace import ray_through, read_model
+from scenefuse.photos.workspace import images_by_name, ray_through, read_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -72,7 +72,7 @@ def triangulate_consistent(
         StageError: a photo that is none of `sizes`, a click outside its photo, a point that is clicked once only. Each
             message names the point.
     """
-    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    images = images_by_name(model)
     positions, residuals, labels = [], [], []
     registered, left_out = _registered(clicks, images, sizes)
     for label, own in registered.items():
@@ -101,7 +101,7 @@ def triangulate_consistent(
 def marked_size(clicks: Clicks, model: pycolmap.Reconstruction, sizes: Sizes | None = None) -> float:
     """How large what is clicked is in the photos: median diagonal of the box of a photo's clicks, in pixels of the
     model's photos; 0 where no photo with a camera has two. Arguments as of `triangulate`."""
-    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    images = images_by_name(model)
     sizes, own = sizes or {}, in_photos(clicks.rows, images, clicks.path)
     photos, spans = np.array([click.photo for click in own]), []
     for name in sorted(set(photos) & set(images)):

@@ -64,8 +64,8 @@ class LocalFrame:
     @property
     def crs_unit(self) -> str:
         """The unit of `crs`, "m" for metres."""
-        unit = pyproj.CRS.from_user_input(self.crs).axis_info[0].unit_name
-        return "m" if unit in ("metre", "meter") else unit
+        crs = pyproj.CRS.from_user_input(self.crs)
+        return "m" if unit_m(crs) == 1 else crs.axis_info[0].unit_name
 
     def in_crs(self, x_in_local: Array) -> Array:
         """(N, 3) east, north, up in metres to (N, 3) easting, northing, altitude in `crs` and its unit, exactly.

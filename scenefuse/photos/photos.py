@@ -47,7 +47,7 @@ class Photo:
         vertical_sd_m: of the altitude, likewise.
         focal_mm: EXIF's focal length as it is, or None.
         position_note: why there is no position though EXIF or XMP give one, or what was assumed of it, or "".
-        unused_bits: leading bits of its pixel values, of 8 or 16, that are 0 throughout.
+        unused_bits: leading bits of its pixels, of 8 or 16, that are 0 in all but a few hot ones.
     """
 
     name: str
@@ -75,8 +75,9 @@ class Photo:
 def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
     """List the photos of a folder and its subfolders, check that every one can be decoded, and stand them upright.
 
-    Photos that EXIF says are rotated are turned and written again; all others are linked. From here on pixels count as
-    people see them. A geo.txt in the folder takes the place of the positions in EXIF.
+    Photos that EXIF says are rotated are turned and written again; all others are linked, unless all are dark or use
+    few of their bits: then they are written brighter. From here on pixels count as people see them. A geo.txt in the
+    folder takes the place of the positions in EXIF.
 
     Args:
         folder: folder of photos; JPEG, PNG, TIFF or BMP.

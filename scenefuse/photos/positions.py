@@ -30,8 +30,6 @@ LATITUDE = _xmp("drone-dji:(?:Gps)?Latitude|exif:GPSLatitude", "[^\"'<]{1,60}")
 LONGITUDE = _xmp("drone-dji:(?:Gps)?Longt?itude|exif:GPSLongitude", "[^\"'<]{1,60}")
 ALTITUDE = _xmp("drone-dji:AbsoluteAltitude|exif:GPSAltitude", "[^\"'<]{1,60}")
 BELOW = _xmp("exif:GPSAltitudeRef", r"\d")
-# References of an altitude that lies below its zero, an ellipsoid's or the sea's (EXIF 3.0).
-BELOW_ZERO = (1, 3)
 # A number in text, perhaps a fraction.
 NUMBER = re.compile(r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)(?:\s*/\s*(\d+(?:\.\d*)?))?")
 
@@ -109,8 +107,9 @@ def _altitude(value: Any, reference: Any) -> float | None:
     """Metres, negative where value or reference say so; None where there are none."""
     if isinstance(reference, bytes) and reference[:1] < b"0":
         reference = tuple(reference)
+    # EXIF 3.0: 1 is below the ellipsoid, or whatever zero; 3 below the sea.
     (altitude, *_), (code, *_) = _parts(value) or [None], _parts(reference) or [None]
-    return altitude if altitude is None or code not in BELOW_ZERO else -abs(altitude)
+    return altitude if altitude is None or code not in (1, 3) else -abs(altitude)
 
 
 def _parts(value: Any) -> list[float | None]:

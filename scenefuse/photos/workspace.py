@@ -213,6 +213,11 @@ def posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
 
 
+def images_by_name(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
+    """The images of a model that have a pose, by name."""
+    return {image.name: image for image in posed_images(model)}
+
+
 def view_of(model: pycolmap.Reconstruction, image: pycolmap.Image) -> View:
     """The pinhole camera of a posed image; a lens's distortion is left out."""
     camera, pose = model.cameras[image.camera_id], np.eye(4)

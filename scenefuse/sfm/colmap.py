@@ -14,8 +14,8 @@ from scenefuse.core.stage import threads
 ITERATIONS, LINEAR_SOLVER_ITERATIONS, TOLERANCE = 100, 200, 0.0
 # Relative gain that ends an adjustment which only compares or repeats.
 ROUGH_TOLERANCE = 1e-7
-# Observations with a larger error are dropped; COLMAP's own.
-MAX_REPROJECTION_ERROR_PX = 4.0
+# Observations with a larger error are dropped, as COLMAP's mapper does.
+MAX_REPROJECTION_ERROR_PX = pycolmap.IncrementalMapperOptions().filter_max_reproj_error
 # The smallest model that has a shape.
 MIN_PHOTOS = 3
 # Reprojection error at which an observation loses half its weight (Cauchy; Triggs et al. 1999).

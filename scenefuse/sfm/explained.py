@@ -15,7 +15,7 @@ from scenefuse.sfm.colmap import MAX_REPROJECTION_ERROR_PX
 
 # Matches that chance hardly gives a pair: as many as COLMAP needs to place a photo. Between leaves, guided matching
 # along a wrong epipolar line finds 15 to 20.
-STRONG_PAIR = 30
+STRONG_PAIR = pycolmap.IncrementalMapperOptions().abs_pose_min_num_inliers
 # Share of the matches of a photo's strong pairs that the model explains where the photo stands right. A sculpture alike
 # from two sides leaves 0.76; in models with a group of frames in wrong places some had 0.28 to 0.66.
 MIN_EXPLAINED = 0.7

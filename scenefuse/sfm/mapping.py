@@ -28,7 +28,6 @@ from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.photos import orientations_in, read_photos
 from scenefuse.sfm.colmap import (
     ITERATIONS,
-    MAX_REPROJECTION_ERROR_PX,
     MIN_PHOTOS,
     ROUGH_TOLERANCE,
     TOLERANCE,
@@ -322,7 +321,6 @@ def _mapper_options(
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
     options.ba_global_max_num_iterations = ITERATIONS
-    options.mapper.filter_max_reproj_error = MAX_REPROJECTION_ERROR_PX
     options.min_model_size = MIN_PHOTOS
     if calibrated:
         # COLMAP leaves photos out whose lens looks like a failed adjustment: with coefficients over 1, as those of a

@@ -103,7 +103,7 @@ def match_features(
             median = int(np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()]))
         verified, inliers = int(np.count_nonzero(per_pair)), int(np.sum(per_pair))
         if verified == 0:
-            advice = "check that the photos overlap, are sharp and textured"
+            advice = "check that they overlap, are sharp and textured"
             if median < FEW_FEATURES:
                 advice = f"they have {median} features in the median, too few to match: {DULL}"
             raise StageError(f"none of the {len(pairs)} pairs of photos of {photos} show the same thing; {advice}")

@@ -266,6 +266,16 @@ def test_wrong_cameras_are_named(tmp_path):
         read_posed_photos(tmp_path / "opensfm/reconstruction.json", tmp_path / "photos")
 
 
+def test_where_cameras_were_given_the_advice_is_about_these(tmp_path):
+    with_database(tmp_path)
+    path = nerfstudio(tmp_path)
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | {"frames": content["frames"][:4]}))
+    with pytest.raises(StageError, match=r"only 4 of 9 photos have a camera in .*Export the cameras of all") as error:
+        mapped(tmp_path, path)
+    assert not re.search("overlap|blur|texture", str(error.value))
+
+
 def test_cameras_of_metashape_lie_where_a_chunk_in_local_coordinates_was_placed(tmp_path):
     turn = Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix()
     inside = f"<rotation>{' '.join(map(repr, turn.ravel().tolist()))}</rotation><translation>1 2 3</translation>"

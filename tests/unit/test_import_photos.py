@@ -1,8 +1,7 @@
 """Posed photos of three formats: a known point lands on the known pixel in each, and bad input is one sentence."""
 
 import json
-import subprocess
-import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,20 +14,20 @@ from scipy.spatial.transform import Rotation
 from support.painted_sphere import CENTER, RADIUS, sphere_views
 
 from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates
 from scenefuse.nerf.render import RenderedView
 from scenefuse.nerf.rendered_maps import RenderedMapSettings, measure_quality
-from scenefuse.nerf.train_nerf import TrainingOptions, train_nerf
+from scenefuse.nerf.train_nerf import TrainingOptions, _nerf_settings, train_nerf
 from scenefuse.nerf.training import NerfRecipe
 from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
 from scenefuse.photos.views import load_views
 from scenefuse.sfm.import_photos import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
 
-ROOT = Path(__file__).resolve().parents[2]
-LEGO = ROOT.parent / "shared/data/lego"
+LEGO = Path(__file__).resolve().parents[3] / "shared/data/lego"
 WIDTH, HEIGHT = 96, 64
 LENS = np.array([[80.0, 0, 50], [0, 84, 30], [0, 0, 1]])
 BENT = {"k1": -0.12, "k2": 0.02, "p1": 0.003, "p2": -0.002}
@@ -382,57 +381,46 @@ def quick(tmp_path):
     return tmp_path / "quick.yaml"
 
 
-def sphere_on_disk(root, form):
-    """The painted sphere as transforms_train.json with alpha, or as a COLMAP model with masks."""
+def sphere_on_disk(root):
+    """The painted sphere as a COLMAP model with masks."""
     images, masks, k, object_from_cam, _ = sphere_views(24)
-    frames, rows = [], []
+    rows = []
     for i, (image, mask, pose) in enumerate(zip(images, masks, object_from_cam)):
-        matte = mask.astype(np.uint8) * 255
-        write(root / "images", i, image[..., ::-1], matte if form == "blender" else None)
-        write(root / "masks", i, matte)
-        frames.append({"file_path": f"images/{i:02d}", "transform_matrix": opengl(pose)})
+        write(root / "images", i, image[..., ::-1])
+        write(root / "masks", i, mask.astype(np.uint8) * 255)
         back = np.linalg.inv(pose)
         numbers = *np.roll(Rotation.from_matrix(back[:3, :3]).as_quat(), 1), *back[:3, 3]
         rows.append(f"{i + 1} {' '.join(f'{n:.15g}' for n in numbers)} 1 {i:02d}.png\n\n")
-    if form == "blender":
-        content = {"camera_angle_x": 2 * np.arctan(0.5 * 48 / k[0, 0, 0]), "frames": frames}
-        (root / "transforms_train.json").write_text(json.dumps(content))
-    else:
-        (root / "sparse").mkdir()
-        (root / "sparse/cameras.txt").write_text(f"1 PINHOLE 48 48 {k[0, 0, 0]} {k[0, 1, 1]} 24 24\n")
-        (root / "sparse/images.txt").write_text("".join(rows))
-        (root / "sparse/points3D.txt").write_text("")
+    (root / "sparse").mkdir()
+    (root / "sparse/cameras.txt").write_text(f"1 PINHOLE 48 48 {k[0, 0, 0]} {k[0, 1, 1]} 24 24\n")
+    (root / "sparse/images.txt").write_text("".join(rows))
     return root
 
 
-@pytest.mark.parametrize("form", ["blender", "colmap"])
-def test_a_sphere_from_the_files_to_its_cloud(tmp_path, quick, form):
-    data, out = sphere_on_disk(tmp_path / "in", form), tmp_path / "out"
-    masks = data / "masks" if form == "colmap" else None
-    assert train_nerf(data=data, out=out, masks=masks, config=quick, epochs=4, options=OPTIONS) == 0
+def test_a_sphere_from_the_files_to_its_cloud_and_a_nerf_without_a_cloud(tmp_path, quick, monkeypatch):
+    data, out = sphere_on_disk(tmp_path / "in"), tmp_path / "out"
+    trained = {"data": data, "out": out, "masks": data / "masks", "config": quick, "epochs": 4}
+    assert train_nerf(**trained, options=OPTIONS) == 0
     report = read_json(out / "report.json")
     assert value(report["nerf"], "photos_measured") == 2 and value(report["nerf"], "psnr_held_out") > 15
-    assert value(report, "settings")["nerf"]["recipe"]["mask_band_px"] == (0 if form == "blender" else 2)
+    assert value(report, "settings")["nerf"]["recipe"]["mask_band_px"] == 2
     distance = np.linalg.norm(read_cloud(out / "object.ply").points - CENTER, axis=1)
     assert np.median(np.abs(distance - RADIUS)) < 0.1
     assert sorted(p.name for p in out.iterdir()) == sorted(
         ["masks", "nerf", "object.ply", "renders.png", "report.json", "steps", "undistorted"]
     )
     assert (out / "renders.png").stat().st_size > 5000
+    # The same NeRF again, of which nothing is sure enough.
+    monkeypatch.setattr("scenefuse.nerf.train_nerf.train_object_nerf", lambda **_: None)
+    strict = replace(OPTIONS, gates=replace(OPTIONS.gates, min_confidence=1.0))
+    assert train_nerf(**trained, options=strict) == 3
+    assert "no surface found" in value(read_json(out / "report.json"), "no_cloud_because")
+    assert not (out / "object.ply").exists()
 
 
-def test_a_nerf_without_a_cloud_ends_with_three_and_the_reason(tmp_path, quick):
-    settings = yaml.safe_load(quick.read_text())
-    settings["object"]["cloud"]["min_views"] = 24
-    quick.write_text(yaml.safe_dump(settings))
-    data = sphere_on_disk(tmp_path / "in", "blender")
-    command = [sys.executable, ROOT / "scripts/train_nerf.py", "--data", data, "--config", quick, "--out", "out"]
-    command += ["--epochs", 4, "--warmup-epochs", 0.2, "--learning-rate", 0.01, "--grid-learning-rate", 0.02]
-    command += ["--images-per-batch", 8, "--rays-per-image", 64, "--occupancy-cells", 32, "--min-confidence", 1]
-    done = subprocess.run(list(map(str, command)), cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 3, done.stderr
-    assert "no surface found" in value(read_json(tmp_path / "out/report.json"), "no_cloud_because")
-    assert not (tmp_path / "out/object.ply").exists()
+def test_exact_masks_have_no_band_that_is_left_out():
+    wanted = read_settings(None)["object"]
+    assert [_nerf_settings(wanted, OPTIONS, 4, exact).recipe.mask_band_px for exact in (True, False)] == [0, 2]
 
 
 @pytest.mark.parametrize(

@@ -116,6 +116,22 @@ def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
     assert [photo.name for photo in found] == ["b.jpg", "c.jpg"]
     assert notes == ["the model sparse/1 is taken, with 2 photos, and not sparse/0 with 1"]
 
+    lens = {"projection_type": "perspective", "width": 40, "height": 30, "focal": 1.0, "k1": 0.0, "k2": 0.0}
+    shot = {"rotation": [0.0, 0.0, 0.0], "translation": [0.0, 0.0, 1.0], "camera": "c"}
+    parts = [{"cameras": {"c": lens}, "shots": dict.fromkeys(names, shot)} for names in (["c.jpg"], ["a.jpg", "b.jpg"])]
+    (tmp_path / "reconstruction.json").write_text(json.dumps(parts))
+    found, _, notes = read_posed_photos(tmp_path / "reconstruction.json", folder)
+    assert [photo.name for photo in found] == ["a.jpg", "b.jpg"]
+    assert notes == ["the model 1 is taken, with 2 photos, and not 0 with 1"]
+
+
+def test_a_model_of_colmap_whose_poses_are_no_numbers_is_named(tmp_path):
+    folder = photos(tmp_path / "images", "a.jpg")
+    with pytest.raises(StageError, match="the pose of a.jpg is no rotation and translation"):
+        read_posed_photos(model(tmp_path / "sparse", f"1 {TURN} -inf -inf inf 1 a.jpg\n\n"), folder)
+    with pytest.raises(StageError, match="holds no cameras of COLMAP that can be read .*neither an image nor its"):
+        read_posed_photos(model(tmp_path / "sparse", f"1 {TURN} 0 0\n"), folder)
+
 
 def test_photos_of_a_transforms_json_are_found_in_a_folder_of_another_name(tmp_path):
     folder = photos(tmp_path / "photos", "a.JPG", "b.JPG")

@@ -10,8 +10,6 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.tables import read_lines, read_text
 from scenefuse.photos.cameras.posed_photo import GivenCamera, colmap_camera
 
-# A line of images.txt: id, quaternion, translation, camera's id, and the name, which may hold blanks.
-BEFORE_NAME = 9
 Image = tuple[str, int, list[float]]
 
 
@@ -52,13 +50,14 @@ def _text_images(file: Path) -> list[Image]:
     found: list[Image] = []
     after_image = False
     for number, line in enumerate(read_text(file).splitlines(), 1):
-        words = line.split(maxsplit=BEFORE_NAME)
+        # Id, quaternion, translation, camera's id, and the name, which may hold blanks.
+        words = line.split(maxsplit=9)
         if line.startswith("#"):
             continue
         if after_image and (not words or _are_observations(line.split())):
             after_image = False
         elif words:
-            if len(words) <= BEFORE_NAME:
+            if len(words) < 10:
                 raise ValueError(f"{file.name}, line {number}: neither an image nor its observations")
             found.append((words[9].strip(), int(words[8]), [float(word) for word in words[1:8]]))
             after_image = True

@@ -28,8 +28,8 @@ def find_opensfm(data: Path) -> Path | None:
     return next((data / place for place in PLACES if (data / place).is_file()), None)
 
 
-def read_opensfm(file: Path) -> list[GivenCamera]:
-    """The posed photos of the reconstruction with most of them; lenses perspective and brown.
+def read_opensfm(file: Path) -> dict[str, list[GivenCamera]]:
+    """The posed photos of each of the file's reconstructions; lenses perspective and brown.
 
     OpenSfM counts pixels from the middle of the photo, in units of its longer side; a pose is an angle-axis rotation
     and a translation into the camera, whose axes are OpenCV's.
@@ -38,9 +38,14 @@ def read_opensfm(file: Path) -> list[GivenCamera]:
         StageError: a lens is of another kind.
         ValueError, KeyError, TypeError: the file is no such JSON.
     """
-    largest = max(json.loads(read_text(file)), key=lambda part: len(part["shots"]))
-    cameras = {name: _camera(entry, f"{file}, camera {name}") for name, entry in largest["cameras"].items()}
-    return [GivenCamera(name, cameras[shot["camera"]], _pose(shot)) for name, shot in sorted(largest["shots"].items())]
+    found, parts = {}, json.loads(read_text(file))
+    if not isinstance(parts, list):
+        raise TypeError("it is no list of reconstructions")
+    for number, part in enumerate(parts):
+        cameras = {name: _camera(entry, f"{file}, camera {name}") for name, entry in part["cameras"].items()}
+        shots = sorted(part["shots"].items())
+        found[str(number)] = [GivenCamera(name, cameras[shot["camera"]], _pose(shot)) for name, shot in shots]
+    return found
 
 
 def opensfm_place(file: Path) -> Place | None:

@@ -10,6 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
+from scenefuse.photos.photo_files import MAX_PIXELS
 from scenefuse.photos.photos import SHAPE_TOLERANCE
 
 # EXIF orientation -> clockwise quarter turns that stand a stored photo upright; the others are mirrored.
@@ -20,9 +21,6 @@ FROM_STORED = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 
 FLIP = np.diag([1.0, -1.0, -1.0])
 # Parameters of a lens that a turn leaves as they are.
 EVEN = ("f", "k", "k1", "k2", "k3", "k4", "k5", "k6")
-
-# Largest side of a photo, in pixels, of which a camera is believed.
-MAX_SIDE_PX = 100_000
 
 Size = tuple[int, int]
 
@@ -75,7 +73,7 @@ def colmap_camera(model: str, width: float, height: float, params: Sequence[floa
     """
     if model not in pycolmap.CameraModelId.__members__ or model in ("INVALID", "EQUIRECTANGULAR"):
         raise ValueError(f"the camera model {model} is not read; undistort the photos to PINHOLE first")
-    if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX and np.isfinite(params).all()):
+    if not (min(width, height) >= 1 and width * height <= MAX_PIXELS and np.isfinite(params).all()):
         raise ValueError(f"a camera's size is {width:g} x {height:g} pixels, and its parameters are {list(params)}")
     camera = pycolmap.Camera(model=model, width=round(width), height=round(height), params=list(map(float, params)))
     if not camera.verify_params():

@@ -66,7 +66,7 @@ def read_posed_photos(cameras: Path, folder: Path | None) -> tuple[list[PosedPho
     masks = {one.mask for one in given}
     files = files_by_name([one.name for one in given], folder, str(cameras))
     files = {name: file for name, file in files.items() if file not in masks}
-    photos = [_posed(one, files[one.name]) for one in given if one.name in files]
+    photos = [_posed(one, files[one.name], str(cameras)) for one in given if one.name in files]
     missing = [one.name for one in given if one.name not in files]
     if not photos:
         raise StageError(
@@ -111,15 +111,17 @@ def _format_of(cameras: Path) -> tuple[Path, str]:
 
 
 def _read(file: Path, program: str) -> tuple[list[GivenCamera], list[str]]:
-    """The cameras of a file, or those of a folder's COLMAP model with most of them; and a note on the other models."""
-    if program != "COLMAP":
-        readers = {"Metashape": read_metashape, "Bundler": _read_bundler, "OpenSfM": read_opensfm}
+    """The cameras of a file, or of a folder with COLMAP models; of several models those of the largest, and a note."""
+    readers = {"Metashape": read_metashape, "Bundler": _read_bundler}
+    if program == "COLMAP":
+        models = {str(m.relative_to(file)): _tried(read_colmap, m, program) for m in colmap_models(file)}
+    elif program == "OpenSfM":
+        models = _tried(read_opensfm, file, program)
+    else:
         return _tried(readers.get(program, read_transforms), file, program), []
-    found = [(_tried(read_colmap, model, program), model.relative_to(file)) for model in colmap_models(file)]
-    (largest, model), *others = sorted(found, key=lambda one: -len(one[0]))
-    counts = ", ".join(f"{other} with {len(given)}" for given, other in others)
-    notes = [f"the model {model} is taken, with {len(largest)} photos, and not {counts}"] if others else []
-    return largest, notes
+    (name, largest), *others = sorted(models.items(), key=lambda model: -len(model[1])) or [("", [])]
+    counts = ", ".join(f"{other} with {len(given)}" for other, given in others)
+    return largest, [f"the model {name} is taken, with {len(largest)} photos, and not {counts}"] if others else []
 
 
 def _tried(reader: Callable[[Path], Found], file: Path, program: str) -> Found:
@@ -134,13 +136,20 @@ def _tried(reader: Callable[[Path], Found], file: Path, program: str) -> Found:
         raise StageError(f"{file} holds no cameras of {program} that can be read ({why}); export them again") from None
 
 
-def _posed(one: GivenCamera, file: Path) -> PosedPhoto:
+def _posed(one: GivenCamera, file: Path, where: str) -> PosedPhoto:
     """A given camera with the file of its photo; StageError where its pose is none."""
-    turn = one.object_from_cam[:3, :3]
-    if not np.isfinite(one.object_from_cam).all() or np.abs(turn.T @ turn - np.eye(3)).max() > MAX_SKEW:
-        raise StageError(f"the camera of {one.name} has no pose of a rotation and a position; export the cameras again")
+    pose = one.object_from_cam.copy()
+    turn = pose[:3, :3]
+    rigid = np.isfinite(pose).all() and np.abs(turn.T @ turn - np.eye(3)).max() < MAX_SKEW and np.linalg.det(turn) > 0
+    if not rigid:
+        raise StageError(
+            f"{where}: the pose of {one.name} is no rotation and translation; remove scale and mirroring, and export"
+            " the cameras again"
+        )
+    left, _, right = np.linalg.svd(turn)
+    pose[:3, :3] = left @ right
     camera = one.camera if isinstance(one.camera, pycolmap.Camera) else one.camera(file)
-    return PosedPhoto(one.name, file, camera, one.object_from_cam, one.mask, one.held_out)
+    return PosedPhoto(one.name, file, camera, pose, one.mask, one.held_out)
 
 
 def _read_bundler(file: Path) -> list[GivenCamera]:

@@ -99,9 +99,5 @@ def _pose(matrix: Any, where: str) -> NDArray[np.float64]:
         raise StageError(f"{where}: transform_matrix has to be 4 x 4 numbers; export the cameras again")
     pose = np.eye(4)
     pose[:3] = given[:3]
-    axes = pose[:3, :3]
-    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3 or np.linalg.det(axes) < 0:
-        raise StageError(f"{where}: transform_matrix is no rotation and translation; remove scale and mirroring")
-    left, _, right = np.linalg.svd(axes)
-    pose[:3, :3] = left @ right @ FLIP
+    pose[:3, :3] = pose[:3, :3] @ FLIP
     return pose
