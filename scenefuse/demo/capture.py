@@ -43,16 +43,6 @@ class FlightSettings:
     gps_noise_vertical: float = 1.0
     """Standard deviation of the EXIF height, metres."""
 
-    @property
-    def height_px(self) -> int:
-        """Rows of a photo, which is four to three."""
-        return round(0.75 * self.width_px)
-
-    @property
-    def focal_px(self) -> float:
-        """Focal length."""
-        return FOCAL_WIDTHS * self.width_px
-
 
 @dataclass(frozen=True)
 class OrbitSettings:
@@ -69,15 +59,15 @@ class OrbitSettings:
     supersampling: int = 2
     """Samples along each side of a pixel."""
 
-    @property
-    def height_px(self) -> int:
-        """Rows of a photo, which is four to three."""
-        return round(0.75 * self.width_px)
 
-    @property
-    def focal_px(self) -> float:
-        """Focal length."""
-        return FOCAL_WIDTHS * self.width_px
+def height_px(width_px: int) -> int:
+    """Rows of a photo, which is four to three."""
+    return round(0.75 * width_px)
+
+
+def focal_px(width_px: int) -> float:
+    """Focal length of a photo."""
+    return FOCAL_WIDTHS * width_px
 
 
 def render_scene(*, photos: Path, truth: Path, settings: FlightSettings, camera: bodies.Kind, seed: int) -> None:
@@ -98,7 +88,7 @@ def render_scene(*, photos: Path, truth: Path, settings: FlightSettings, camera:
     Raises:
         StageError: a flight without photos, or photos without pixels.
     """
-    _check(settings.columns * settings.rows + settings.obliques, settings.width_px, settings.height_px)
+    _check(settings.columns * settings.rows + settings.obliques, settings.width_px)
     world = build_world(seed)
     body = bodies.FLIGHT[camera]
     cameras = flight(world, settings, body, seed)
@@ -112,7 +102,7 @@ def render_scene(*, photos: Path, truth: Path, settings: FlightSettings, camera:
             _write_mesh(folder / "meshes" / f"{name}.ply", world, owner)
         content = cameras_json(cameras) | _exposures_json(cameras, exposures)
         content["origin"] = quantity(list(ORIGIN), "degrees north, degrees east, m")
-        content["ground_sampling_distance"] = quantity(settings.altitude / settings.focal_px, "m")
+        content["ground_sampling_distance"] = quantity(settings.altitude / focal_px(settings.width_px), "m")
         content["mapped_area"] = quantity([[-MAPPED[0], -MAPPED[1]], [MAPPED[0], MAPPED[1]]], "m")
         content["objects"] = {name: _extent(world, name) for name in world.names}
         write_json(folder / "cameras.json", content)
@@ -137,7 +127,7 @@ def render_object(
     Raises:
         StageError: an unknown object, an orbit without photos, or photos without pixels.
     """
-    _check(settings.views, settings.width_px, settings.height_px)
+    _check(settings.views, settings.width_px)
     if not settings.elevations_deg or not 0 < settings.fill <= 1:
         raise StageError(
             f"an orbit needs an elevation and a fill in 0..1, not {settings.elevations_deg} and {settings.fill}"
@@ -159,7 +149,9 @@ def render_object(
 def flight(world: World, settings: FlightSettings, body: Body, seed: int) -> Cameras:
     """A grid of photos that look down, then a strip from the south and one from the east that look obliquely."""
     rng = np.random.default_rng([seed, 1])
-    footprint = np.array([settings.width_px, settings.height_px]) * settings.altitude / settings.focal_px
+    footprint = (
+        np.array([settings.width_px, height_px(settings.width_px)]) * settings.altitude / focal_px(settings.width_px)
+    )
     reach = np.maximum(np.array(MAPPED) - 0.27 * footprint, 5.0)
     rotations, centres = [], []
     for k, x in enumerate(np.linspace(-reach[0], reach[0], settings.columns)):
@@ -221,8 +213,8 @@ def _capture(
     centres: list[NDArray[np.float64]],
 ) -> Cameras:
     """Photos of a body at many poses."""
-    width, height = settings.width_px, settings.height_px
-    k_matrix = pinhole(settings.focal_px, width, height, body.shift)
+    width, height = settings.width_px, height_px(settings.width_px)
+    k_matrix = pinhole(focal_px(width), width, height, body.shift)
     return Cameras(names, k_matrix, width, height, np.array(rotations), np.array(centres), np.array(body.distortion))
 
 
@@ -230,19 +222,19 @@ def _distance(settings: OrbitSettings, tall: float, wide: float, elevation: floa
     """How far away an object fills its share of the height, and all of it stays inside the photo."""
     projected = tall * np.cos(elevation) + wide * np.sin(elevation)
     shares = (
-        tall / (settings.fill * settings.height_px),
+        tall / (settings.fill * height_px(settings.width_px)),
         wide / (0.85 * settings.width_px),
-        projected / (0.9 * settings.height_px),
+        projected / (0.9 * height_px(settings.width_px)),
     )
     # The near side of a wide object is closer than its middle.
-    return settings.focal_px * max(shares) + 0.3 * wide
+    return focal_px(settings.width_px) * max(shares) + 0.3 * wide
 
 
-def _check(count: int, width: int, height: int) -> None:
+def _check(count: int, width: int) -> None:
     if count <= 0:
         raise StageError("a capture without photos; set at least one photo in the demo's settings")
-    if width < 16 or height < 16:
-        raise StageError(f"the demo's photos would be {width} x {height} pixels; use at least 16 x 16")
+    if height_px(width) < 16:
+        raise StageError(f"the demo's photos would be {width} x {height_px(width)} pixels; use at least 16 x 16")
 
 
 def _extent(world: World, name: str) -> dict[str, dict[str, object]]:

@@ -29,10 +29,8 @@ class ClickSettings:
     """Photos used at most."""
     separation_deg: float = 12.0
     """Smallest angle at the object between the views of two photos used."""
-    least_miss_px: float = 3.0
-    """How far a click is off the point that it was meant for, at least."""
-    most_miss_px: float = 10.0
-    """The same, at most."""
+    miss_px: tuple[float, float] = (3.0, 10.0)
+    """How far a click is off the point that it was meant for, at least and at most."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +41,8 @@ class PromptSettings:
     """Clicks inside the object."""
     box: bool = True
     """Whether two more are the corners of a box around it."""
-    least_miss_px: float = 3.0
-    """How far a click is off the spot that it was meant for, at least."""
-    most_miss_px: float = 10.0
-    """The same, at most."""
+    miss_px: tuple[float, float] = (3.0, 10.0)
+    """How far a click is off the spot that it was meant for, at least and at most."""
 
 
 def click_points(*, name: str, cameras: Path, clicks: Path, settings: ClickSettings, seed: int) -> None:
@@ -77,7 +73,7 @@ def click_points(*, name: str, cameras: Path, clicks: Path, settings: ClickSetti
             f"only {len(names)} points of {name} are visible in two of the {len(used)} photos used from {cameras}; "
             "render more photos, or allow more photos or a smaller separation for the clicks"
         )
-    misses = random_misses(len(landmarks) * len(used), settings.least_miss_px, settings.most_miss_px, seed)
+    misses = random_misses(len(landmarks) * len(used), *settings.miss_px, seed)
     lines = ["point\tphoto\tx_px\ty_px"]
     for k, point in enumerate(landmarks):
         for photo, miss in zip(used, misses[k * len(used) :]):
@@ -136,7 +132,7 @@ def clicks_on(
         rows, columns = np.nonzero(mask)
         spots += [np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1.0]
         labels += ["box"] * 2
-    found = np.array(spots) + random_misses(len(spots), settings.least_miss_px, settings.most_miss_px, rng)
+    found = np.array(spots) + random_misses(len(spots), *settings.miss_px, rng)
     return labels, np.clip(found, 1.0, np.array(mask.shape[::-1]) - 1.0)
 
 

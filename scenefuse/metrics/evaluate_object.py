@@ -123,7 +123,6 @@ def depth_results(stages: list[Path], known: ObjectTruth, max_photos: int = COMP
         result |= {
             f"{stage.name}_depth_error": quantity(float(np.median(error)) if len(error) else None, "diagonals"),
             f"{stage.name}_depth_within_1pct": quantity(float((error <= 0.01).sum()) / pixels if pixels else None, "1"),
-            f"{stage.name}_depth_present": quantity(len(error) / pixels if pixels else None, "1"),
         }
     return result
 
@@ -230,12 +229,10 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, sample
     known = read_object_truth(inputs.workspace, inputs.truth_scene, inputs.truth_object, samples, seed)
     truth_from_scene = Sim3.from_matrix(np.array(value(read_json(inputs.scene_json), "truth_from_scene")))
     points = read_cloud(inputs.cloud).points
-    position = float(np.median(known.fit.position)) / known.diagonal
     result: dict[str, Any] = {
         "diagonal": quantity(known.diagonal, "m"),
         **({} if inputs.masks is None else _mask_results(inputs, inputs.masks)),
         **camera_results(known.fit, len(known.orbit.names)),
-        "camera_position_over_diagonal": quantity(position, "1"),
         **depth_results(list(inputs.stages), known),
         **cloud_results(known.fit.truth_from_model.apply(points), known, samples, seed),
     }
@@ -273,21 +270,17 @@ def _around_object(inputs: EvaluationInputs, known: ObjectTruth, truth_from_scen
 
 def _mask_results(inputs: EvaluationInputs, masks: Path) -> dict[str, Any]:
     """IoU of every mask; the true mask takes the way of its photo, through the model's own camera, into the mask's."""
-    scores, missing = {}, 0
+    ious: list[float] = []
     taken = read_cameras(inputs.sparse)
     for view in read_views(inputs.undistorted / "sparse"):
         path = masks / f"{Path(view.name).stem}.png"
         if not path.is_file():
-            missing += 1
             continue
         true = undistort_picture(read_gray(inputs.truth_object / "masks" / path.name), taken[view.name], view)
-        scores[view.name] = mask_iou(read_gray(path) > 127, true > 127)
-    ious = list(scores.values())
+        ious.append(mask_iou(read_gray(path) > 127, true > 127))
     return {
         "mask_iou_mean": quantity(float(np.mean(ious)) if ious else None, "1"),
         "mask_iou_min": quantity(min(ious, default=None), "1"),
-        "mask_iou_worst": quantity(min(scores, key=lambda n: scores[n], default=None), ""),
-        "masks_missing": quantity(missing, "1"),
     }
 
 

@@ -90,7 +90,6 @@ def _cloud_results(
         "ground_sampling_distance": quantity(gsd, "m"),
         "cloud_distance_median": quantity(float(np.median(to_truth)), "m"),
         "cloud_distance_90": quantity(float(np.quantile(to_truth, 0.9)), "m"),
-        "cloud_distance_median_over_gsd": quantity(float(np.median(to_truth)) / gsd, "1"),
         "terrain_covered": quantity(float(covered.mean()), "1"),
     }
 

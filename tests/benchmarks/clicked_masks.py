@@ -160,7 +160,7 @@ def _trial(
     labels, pixels = clicks_on(true, how, rng)
     middle = _smaller_part(true) if part else None
     if middle is not None:
-        miss = random_misses(1, how.least_miss_px, how.most_miss_px, rng)[0]
+        miss = random_misses(1, *how.miss_px, rng)[0]
         pixels[how.inside - 1] = np.clip(middle + miss, 1.0, np.array(true.shape[::-1]) - 1.0)
     marked = Clicks(Path(name), "labels", tuple(Click(label, name, *pixel) for label, pixel in zip(labels, pixels)))
     row: dict[str, Any] = {"photo": name, "trial": trial}

@@ -22,7 +22,7 @@ ACTION_S = 2.0
 """Of a person, for one action."""
 OTHER_ACTIONS = (
     *("scenefuse init", "photos into a folder", "a row of scenes.tsv", "a row of objects.tsv"),
-    *("scenefuse pick", "choose the photo", "save", "snakemake"),
+    *("scenefuse pick", "choose the photo", "snakemake"),
 )
 CHOOSE = "[...document.querySelectorAll('.thumb .name')].find((e) => e.innerText === given[0]).click();"
 SHOWN = "return document.querySelector('.thumb.here .name')?.innerText === given[0];"
@@ -52,7 +52,6 @@ def clicking(*, photos: Path, photo: str, clicks: tuple[float, ...], weights: Pa
             browser.value(CHOOSE, photo)
             page.until(SHOWN, photo)
             waits = [_click(page, *at) for at in zip(clicks[::2], clicks[1::2])]
-            page.save()
             memory = _memory_mb(server.pid)
             page.until("return !document.body.innerText.includes('Looking for the sharpest');")
             sorted_after = time.monotonic() - start

@@ -158,7 +158,7 @@ def test_clicks_without_noise_meet_at_the_landmarks(tmp_path: Path, world: World
         name="sculpture",
         cameras=tmp_path / "t/cameras.json",
         clicks=table,
-        settings=clicks.ClickSettings(photos=4, separation_deg=20.0, least_miss_px=0.0, most_miss_px=0.0),
+        settings=clicks.ClickSettings(photos=4, separation_deg=20.0, miss_px=(0.0, 0.0)),
         seed=0,
     )
     cameras = read_cameras(tmp_path / "t/cameras.json")
