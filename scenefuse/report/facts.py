@@ -73,7 +73,7 @@ def object_facts(row: Row) -> dict[str, str]:
         if "measured_share" in has:
             facts["Points"] += f"; {percent(has['measured_share'])} of the object's are confirmed by photos"
     facts |= _accuracy(has, unit)
-    if "registered" in has:
+    if "registered" in has and "frames" in has:
         facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used"
     if "added_points" in has:
         facts["File"] = f"objects/{has['object']}/fused.ply; in the scene: completed.ply"
@@ -121,9 +121,9 @@ def scene_facts(row: Row) -> dict[str, str]:
     if "latitude_deg" in has:
         north, east = has["latitude_deg"], has["longitude_deg"]
         facts["Place"] = f"{abs(north):.5f}° {'NS'[north < 0]}, {abs(east):.5f}° {'EW'[east < 0]}"
-    photos = (
-        f"{has['registered']:.0f} of {has['photos']:.0f} photos used" if "registered" in has else "given as a cloud"
-    )
+    photos = "given as a cloud"
+    if "registered" in has and "photos" in has:
+        photos = f"{has['registered']:.0f} of {has['photos']:.0f} photos used"
     facts["Photographed"] = ", ".join(filter(None, [has.get("photographed"), photos]))
     if unit == "m":
         facts["Coordinates"] = f"metres, {_crs_name(has['crs'])}" if "crs" in has else "metres, in a local frame"

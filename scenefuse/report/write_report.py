@@ -22,6 +22,8 @@ from scenefuse.report.view import View, read_view, thin
 PAGE_POINTS = 700_000
 # What such objects have of figures is from an earlier run.
 UNFINISHED = ("failed", "missing")
+# Others look before as after.
+ADDED = ("registered", "ungated")
 BADGES = {"registered": "completed", "unregistered": "not added", "ungated": "not checked", "missing": "not run"}
 Row = dict[str, Any]
 Texts = dict[str, Any]
@@ -116,7 +118,7 @@ def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str
     )
     parts = [f'<section class="card" id="{escape(folder.name)}"><h2>{escape(folder.name)}{badge}</h2>']
     is_finished, figures = status not in UNFINISHED, folder / "figures"
-    pictures = [_slider(figures)] if is_finished and (figures / "before.png").is_file() else []
+    pictures = [_slider(figures)] if status in ADDED and (figures / "before.png").is_file() else []
     parts.append(f'<div class="pair">{"".join(pictures)}{_facts(object_facts(row))}</div>')
     if view is not None and is_finished:
         parts.append(view_section(f"object-{folder.name}", folder.name, view))
