@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from scenefuse.core.fingerprint import reached
 from scenefuse.core.machine import has_gpu
@@ -13,6 +14,12 @@ ROOT = Path(__file__).resolve().parents[1]
 # Without a GPU, Triton's interpreter runs the GPU kernels; it reads this when they are imported.
 if not has_gpu():
     os.environ["TRITON_INTERPRET"] = "1"
+
+# Cases that each fuzz test makes up; `make fuzz` chooses the second.
+CHECKS = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+settings.register_profile("few", max_examples=30, deadline=None, derandomize=True, suppress_health_check=CHECKS)
+settings.register_profile("many", max_examples=1000, deadline=None, derandomize=True, suppress_health_check=CHECKS)
+settings.load_profile("few")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -148,7 +148,10 @@ def _posed(one: GivenCamera, file: Path, where: str) -> PosedPhoto:
         )
     left, _, right = np.linalg.svd(turn)
     pose[:3, :3] = left @ right
-    camera = one.camera if isinstance(one.camera, pycolmap.Camera) else one.camera(file)
+    try:
+        camera = one.camera if isinstance(one.camera, pycolmap.Camera) else one.camera(file)
+    except ValueError as error:
+        raise StageError(f"{where}: the camera of {one.name}: {error}; correct it") from None
     return PosedPhoto(one.name, file, camera, pose, one.mask, one.held_out)
 
 

@@ -81,10 +81,7 @@ def _camera(values: dict[str, Any], where: str) -> Callable[[Path], pycolmap.Cam
         middle = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
         bent = [numbers.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
         params = [focal, numbers.get("fl_y", focal), *middle, *bent, 0.0, 0.0, 0.0]
-        try:
-            return colmap_camera("FULL_OPENCV", width, height, params)
-        except ValueError as error:
-            raise StageError(f"{where}: {error}; correct it") from None
+        return colmap_camera("FULL_OPENCV", width, height, params)
 
     return camera
 
