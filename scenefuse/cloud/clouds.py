@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.formats import read_columns
+from scenefuse.cloud.formats import columns_in_parts
 from scenefuse.cloud.readers.columns import (
     COLOR,
     NORMAL,
@@ -18,8 +18,10 @@ from scenefuse.cloud.readers.columns import (
     Columns,
     bytes_of,
     colors_of,
+    joined,
     positions,
 )
+from scenefuse.cloud.readers.las import ENDINGS, LAS_DIMENSIONS, WITHHELD
 from scenefuse.cloud.readers.ply import Element, header_of
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.transforms import Sim3
@@ -177,23 +179,25 @@ def sampled_rows(count: int, most: int, seed: int) -> NDArray[np.int64]:
 def read_cloud(path: Path) -> Cloud:
     """Read PLY, LAS, LAZ, E57, PCD, text (XYZ, PTS, TXT, ASC, CSV), or a mesh (PLY, OBJ, GLB) as points on its faces.
 
-    Rows without a finite position are left out.
+    Rows without a finite position are left out; so are the classes and the like of LAS, and colours that are all black.
 
     Raises:
         StageError: the file is missing, damaged, of an unknown ending, or holds no points.
     """
-    return read_counted(path)[0]
-
-
-def read_counted(path: Path) -> tuple[Cloud, int]:
-    """`read_cloud`, and how many rows without a finite position were left out."""
-    columns, left_out = finite_rows(read_columns(Path(path)))
+    path = Path(path)
+    columns, left_out = finite_rows(joined(columns_in_parts(path)()))
+    count = left_out + len(columns["x"])
+    if not count:
+        raise StageError(f"{path} holds no points; look at what wrote it")
     if left_out:
-        count = left_out + len(columns["x"])
         print(f"{path}: {left_out} of {count} rows have no finite position and are left out", flush=True)
         if left_out == count:
             raise StageError(f"{path} holds no point with a finite position; look at what wrote it")
-    return cloud_of(columns), left_out
+    if path.suffix.lower() in ENDINGS:
+        black = set(COLOR) <= set(columns) and not any(columns[name].any() for name in COLOR)
+        beside = {*LAS_DIMENSIONS, WITHHELD, *(COLOR if black else ())}
+        columns = {name: values for name, values in columns.items() if name not in beside}
+    return cloud_of(columns)
 
 
 def finite_rows(columns: Columns) -> tuple[Columns, int]:

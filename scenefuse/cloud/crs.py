@@ -1,6 +1,7 @@
 """Coordinate reference systems as survey files name them, and their way to WGS84."""
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +28,7 @@ def read_crs(text: str, where: str) -> pyproj.CRS:
     Raises:
         StageError: `text` names none, or what `usable` says.
     """
-    crs = _named(text)
-    if crs is None:
-        raise StageError(
-            f"{where} begins with '{text.strip()[:60]}', which names no coordinate reference system; write one in the"
-            " first line: EPSG:25832, with heights EPSG:25832+7837, WGS84 UTM 32N, or a PROJ string"
-        )
-    return usable(crs, where)
+    return usable(_named(text, f"{where}, in its first line"), where)
 
 
 def projected_crs(text: str, where: str, heights: bool) -> pyproj.CRS:
@@ -42,13 +37,7 @@ def projected_crs(text: str, where: str, heights: bool) -> pyproj.CRS:
     Raises:
         StageError: `text` names none, one in degrees, or one with heights where there may be none.
     """
-    crs = _named(text)
-    if crs is None:
-        raise StageError(
-            f"{where}: '{text.strip()[:60]}' names no coordinate reference system; write EPSG:25832, with heights"
-            " EPSG:25832+7837, WGS84 UTM 32N, or a PROJ string"
-        )
-    crs = usable(crs, where)
+    crs = usable(_named(text, where), where)
     if not plane(crs).is_projected:
         raise StageError(f"{where}: {crs.name} is in degrees; name a projected one, a UTM zone for instance")
     if crs.is_compound and not heights:
@@ -59,14 +48,17 @@ def projected_crs(text: str, where: str, heights: bool) -> pyproj.CRS:
     return crs
 
 
-def _named(text: str) -> pyproj.CRS | None:
-    """The CRS that a text names, if it does."""
+def _named(text: str, where: str) -> pyproj.CRS:
+    """The CRS that a text names; StageError where it names none."""
     zone = UTM.fullmatch(text.strip())
     code = f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}" if zone else text.strip()
     try:
         return pyproj.CRS.from_user_input(code)
     except pyproj.exceptions.CRSError:
-        return None
+        raise StageError(
+            f"{where}: '{text.strip()[:60]}' names no coordinate reference system; write EPSG:25832, with heights"
+            " EPSG:25832+7837, WGS84 UTM 32N, or a PROJ string"
+        ) from None
 
 
 def usable(crs: pyproj.CRS, where: str, local: bool = False) -> pyproj.CRS:
@@ -108,11 +100,10 @@ def with_units(crs: pyproj.CRS, keys: dict[int, int]) -> pyproj.CRS:
             axis["unit"] = {"type": "LinearUnit", "name": unit[0], "conversion_factor": unit[1]}
         about.pop("id", None)
         crs, own = pyproj.CRS.from_json_dict(about), unit[1]
-    try:
+    heights, factor = None, own
+    with suppress(pyproj.exceptions.CRSError):
         heights = pyproj.CRS.from_epsg(keys.get(4096, 0))
         factor = heights.axis_info[0].unit_conversion_factor
-    except pyproj.exceptions.CRSError:
-        heights, factor = None, own
     unit = LINEAR_UNITS.get(keys.get(4099, 0))
     if unit is not None and abs(unit[1] / factor - 1) > MAX_UNIT_RATIO:
         name = "heights" if heights is None else f"{heights.name} in {unit[0]}"

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, POSITION, Columns, common_names, joined
+from scenefuse.cloud.readers.columns import AT_ONCE, POSITION, Columns, common_names
 from scenefuse.cloud.readers.e57 import read_e57
-from scenefuse.cloud.readers.las import ENDINGS, LAS_DIMENSIONS, WITHHELD, check_projected, las_crs, read_las
+from scenefuse.cloud.readers.las import check_projected, las_crs, read_las
 from scenefuse.cloud.readers.meshes import read_glb, read_obj
 from scenefuse.cloud.readers.pcd import read_pcd
 from scenefuse.cloud.readers.ply import in_rows, read_ply
@@ -75,22 +75,6 @@ def columns_in_parts(path: Path, degrees: bool = False) -> ColumnParts:
         held = list(parts())
         return lambda: iter(held)
     return parts
-
-
-def read_columns(path: Path) -> Columns:
-    """The columns of a cloud file; of LAS without classes and the like, and without colours where all are black.
-
-    Raises:
-        StageError: as of `columns_in_parts`, or there are no points.
-    """
-    columns = joined(columns_in_parts(path)())
-    if len(columns["x"]) == 0:
-        raise StageError(f"{path} holds no points; look at what wrote it")
-    if path.suffix.lower() in ENDINGS:
-        black = set(COLOR) <= set(columns) and not any(columns[name].any() for name in COLOR)
-        left_out = {*LAS_DIMENSIONS, WITHHELD, *(COLOR if black else ())}
-        return {name: values for name, values in columns.items() if name not in left_out}
-    return columns
 
 
 @contextmanager

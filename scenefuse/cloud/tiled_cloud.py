@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, cloud_of, records_of, spacing
 from scenefuse.cloud.readers.columns import AT_ONCE
-from scenefuse.cloud.readers.ply import Element, header_of, read_header
+from scenefuse.cloud.readers.ply import Element, check_size, header_of, read_header
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.transforms import Array
 
@@ -134,7 +134,7 @@ def open_cloud(path: Path) -> TiledCloud:
     row, count = (elements[0].row, elements[0].count) if elements else (None, 0)
     if row is None or not {"x", "y", "z"} <= set(row.names or ()):
         raise StageError(f"{path} is no cloud that a stage of this project wrote; delete it and rerun its stage")
-    _check_size(path, elements, offset)
+    check_size(path, elements, offset, "delete it and rerun the stage that writes it")
     if len(elements) > 1 and elements[1].name == "tile" and elements[1].row == ROW_OF_TILE:
         with open(path, "rb") as file:
             file.seek(offset + count * row.itemsize)
@@ -143,17 +143,6 @@ def open_cloud(path: Path) -> TiledCloud:
         box = np.stack([table[name] for name in BOX], axis=1)
         return TiledCloud(path, row, offset, starts, box[:, :3], box[:, 3:])
     return _in_order(path, row, count, offset)
-
-
-def _check_size(path: Path, elements: list[Element], offset: int) -> None:
-    if any(element.row is None for element in elements):
-        return
-    wanted = offset + sum(element.count * element.row.itemsize for element in elements if element.row is not None)
-    there = path.stat().st_size
-    if there < wanted:
-        raise StageError(
-            f"{path} is cut short: {there} of {wanted} bytes; delete it and rerun the stage that writes it"
-        )
 
 
 def _in_order(path: Path, row: np.dtype[Any], count: int, offset: int) -> TiledCloud:

@@ -40,8 +40,9 @@ def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | 
     """
     ends = cloud.points.min(0, initial=np.inf), cloud.points.max(0, initial=-np.inf)
     ends, apart = ends if len(cloud) else (np.zeros(3), np.zeros(3)), spacing(cloud.points)
-    with laz_in_parts(path, cloud, ends, origin, crs, apart) as append:
-        append(cloud)
+    layout = LasLayout.of(path, cloud, ends, origin, crs, apart)
+    with las_writer(path, layout.header) as writer:
+        writer.write_points(layout.records(cloud))
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,8 @@ class LasLayout:
         cls, path: Path, like: Cloud, box: tuple[NDArray[np.float64], NDArray[np.float64]],
         origin: NDArray[np.float64], crs: str | None, apart: float,
     ) -> "LasLayout":  # fmt: skip
-        """For clouds of `like`'s columns; see `laz_in_parts`."""
+        """For clouds of `like`'s columns in a box between two corners (3,) relative to `origin`; much closer than a
+        millimetre, points that lie `apart` ask for finer steps."""
         import laspy
         import pyproj
 
@@ -133,29 +135,6 @@ def _step_of(path: Path, farthest: NDArray[np.float64], apart: float) -> float:
             flush=True,
         )
     return step
-
-
-@contextmanager
-def laz_in_parts(
-    path: Path, like: Cloud, box: tuple[NDArray[np.float64], NDArray[np.float64]], origin: NDArray[np.float64],
-    crs: str | None, apart: float = np.inf,
-) -> Iterator[Callable[[Cloud], None]]:  # fmt: skip
-    """`write_laz` for clouds of any size: gives a function that appends a part.
-
-    Args:
-        path: output, .laz or .las; it appears when all parts are written.
-        like: a cloud, perhaps empty, with the columns that all parts have.
-        box: two opposite corners (3,) of a box around all points, relative to `origin`.
-        origin: see `write_laz`.
-        crs: see `write_laz`.
-        apart: spacing of the points; much closer than a millimetre it asks for finer steps.
-
-    Raises:
-        StageError: the disk is full.
-    """
-    layout = LasLayout.of(path, like, box, origin, crs, apart)
-    with las_writer(path, layout.header) as writer:
-        yield lambda part: writer.write_points(layout.records(part))
 
 
 @contextmanager

@@ -29,7 +29,7 @@ from support.planted import Trial, errors, plant
 from scenefuse.cloud.clouds import Cloud, read_cloud, records_of, write_cloud
 from scenefuse.cloud.import_cloud import import_scene_cloud
 from scenefuse.cloud.tiled_cloud import BOX, ROW_OF_TILE, TILE, open_cloud, reserved
-from scenefuse.cloud.write_las import laz_in_parts
+from scenefuse.cloud.write_las import LasLayout, las_writer
 from scenefuse.core.job_records import JobRecords
 from scenefuse.core.stage import quantity, read_json, run, value, write_json
 from scenefuse.core.transforms import Array, Sim3
@@ -141,11 +141,11 @@ def make_laz(path: Path, count: int) -> None:
     """The yard as a user has it."""
     yard = Yard(count)
     box = np.full(3, -yard.across * yard.side), np.full(3, yard.across * yard.side)
-    with laz_in_parts(
-        path, Cloud(np.zeros((0, 3)), None, np.zeros((0, 3), np.uint8)), box, UTM, "EPSG:32632"
-    ) as append:
+    none = Cloud(np.zeros((0, 3)), None, np.zeros((0, 3), np.uint8))
+    layout = LasLayout.of(path, none, box, UTM, "EPSG:32632", np.inf)
+    with las_writer(path, layout.header) as writer:
         for low, _, number in yard.tiles():
-            append(yard.points(low, number))
+            writer.write_points(layout.records(yard.points(low, number)))
 
 
 def make_copc(path: Path, count: int) -> None:

@@ -118,7 +118,7 @@ def test_bad_files_are_one_sentence(tmp_path, cloud):
     (tmp_path / "short.ply").write_bytes(whole[:-1000])
     (tmp_path / "text.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
     for name, sentence in {
-        "short.ply": "short.ply is cut short: .* bytes; delete it",
+        "short.ply": "short.ply is cut short: its last .* are missing; delete it",
         "text.ply": "text.ply is no cloud that a stage of this project wrote",
         "none.ply": "none.ply does not exist",
     }.items():

@@ -94,6 +94,7 @@ def _pose(header: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return np.eye(3), np.zeros(3)
     turn, shift = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
     for values, part, axes in ((turn, "rotation", "xyzw"), (shift, "translation", "xyz")):
-        if header.pose.isDefined(part):
-            values[:] = [header.pose[part][axis].value() for axis in axes]
+        for k, axis in enumerate(axes):
+            if header.pose.isDefined(f"{part}/{axis}"):
+                values[k] = header.pose[part][axis].value()
     return Rotation.from_quat(turn if turn.any() else [0, 0, 0, 1]).as_matrix(), shift

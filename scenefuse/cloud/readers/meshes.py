@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import COLOR, Columns, bytes_of
+from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, Columns, bytes_of
 from scenefuse.core.stage import StageError
 
 Array = NDArray[np.float64]
@@ -378,7 +378,9 @@ def _values(document: dict[str, Any], blob: bytes, accessor: int) -> Array:
     kind, count = _kind(about), about["count"]
     if "bufferView" in about:
         table = _stored(document, blob, about, kind, count, width).astype(np.float64)
-    elif count * width <= len(blob):
+    elif count > 256 * AT_ONCE:
+        raise ValueError("it counts more values than a file holds")
+    else:
         table = np.zeros((count, width))
     if "sparse" in about:
         sparse = about["sparse"]

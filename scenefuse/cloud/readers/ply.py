@@ -83,7 +83,7 @@ def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
     if not elements:
         raise ValueError("it does not begin as PLY does")
     if not is_text:
-        _check_size(path, elements, offset)
+        check_size(path, elements, offset)
     if in_rows(path):
         yield from _rows(path, elements[0], offset, is_text, at_once)
         return
@@ -97,19 +97,19 @@ def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
     yield sampled_columns(Mesh(positions(vertex), corners, colors, None, np.full(len(corners), -1)))
 
 
-def _check_size(path: Path, elements: list[Element], offset: int) -> None:
+def check_size(path: Path, elements: list[Element], offset: int, advice: str = "copy it again") -> None:
     """StageError where a binary file is too small for what its header counts; a list takes a byte at least."""
     there = path.stat().st_size - offset
     for element in elements:
         size = len(element.lists) if element.row is None else element.row.itemsize
         there -= size * element.count
         if there < 0:
-            raise _cut_short(path, element.name, min(-(there // size), element.count))
+            raise _cut_short(path, element.name, min(-(there // size), element.count), advice)
 
 
-def _cut_short(path: Path, element: str, missing: int) -> StageError:
+def _cut_short(path: Path, element: str, missing: int, advice: str = "copy it again") -> StageError:
     what = "points" if element == "vertex" else f"rows of {element}"
-    return StageError(f"{path} is cut short: its last {missing} {what} are missing; copy it again")
+    return StageError(f"{path} is cut short: its last {missing} {what} are missing; {advice}")
 
 
 def _mesh_of_bytes(path: Path) -> tuple[Columns, list[Any]]:
@@ -133,6 +133,9 @@ def _mesh_of_text(path: Path, elements: list[Element], offset: int) -> tuple[Col
         for element in elements:
             if element.row is not None:
                 columns = _columns_of_text(path, file, element, element.count)[0]
+                there = len(next(iter(columns.values()), ()))
+                if there < element.count:
+                    raise _cut_short(path, element.name, element.count - there)
                 vertex = columns if element.name == "vertex" else vertex
                 continue
             rows = list(islice((line for line in file if line.strip()), element.count))
@@ -211,7 +214,10 @@ def _elements(lines: list[str], order: str) -> list[Element]:
         if words[:1] == ["element"]:
             found.append((words[1], int(words[2]), {}))
         elif words[:1] == ["property"]:
-            found[-1][2][words[-1]] = words[1]
+            name, columns = words[-1], found[-1][2]
+            while name in columns:
+                name += "_"
+            columns[name] = words[1]
     if any(count < 0 for _, count, _ in found):
         raise ValueError("its header counts less than no rows")
     return [
