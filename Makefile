@@ -3,7 +3,7 @@ CORES ?= 2
 PYTHON ?= python3
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: demo check test lint report bench bench-registration bench-nerf bench-scale mutants audit docs clean
+.PHONY: demo check test lint report bench bench-registration bench-nerf bench-scale fuzz mutants audit docs clean
 
 demo: .venv/ready
 	snakemake --configfile config/demo.yaml --cores $(CORES)
@@ -29,6 +29,10 @@ report: .venv/ready
 	snakemake --configfile config/demo.yaml --cores 1 --report results/summary/snakemake-report.html
 
 bench: bench-registration bench-nerf
+
+# A thousand made-up files, tables and headers for each reader; some minutes.
+fuzz: .venv/tests
+	pytest -n $(CORES) --hypothesis-profile many tests/unit/test_fuzz_*.py
 
 # Inverts each comparison of the registration's gate in turn: the rows of tests/unit/test_gate.py must catch every one; seconds.
 mutants: .venv/ready
