@@ -159,17 +159,10 @@ def _without_loose_parts(
 
 
 def _parts_near(points: Array, marks: Array, link: float, reach: float) -> NDArray[np.bool_]:
-    """Which points belong to a large enough part that a fiducial touches or that mostly lies between fiducials.
-
-    The second counts for parts no one clicked, a wall under a roof for instance: half their points in the fiducials'
-    own box, seen from above.
-    """
+    """Which points belong to a large enough part that a fiducial touches."""
     part_of, counts = parts(points, link)
     touched = np.bincount(part_of, cKDTree(marks).query(points, workers=threads())[0] <= reach) > 0
-    low, high = marks.min(0)[:2], marks.max(0)[:2]
-    between = np.bincount(part_of, ((points[:, :2] >= low) & (points[:, :2] <= high)).all(1))
-    wanted = (counts >= MIN_PART_SHARE * len(points)) & (touched | (between >= 0.5 * counts))
-    return wanted[part_of]
+    return (touched & (counts >= MIN_PART_SHARE * len(points)))[part_of]
 
 
 def parts(points: Array, link: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

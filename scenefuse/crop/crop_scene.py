@@ -12,9 +12,9 @@ from scenefuse.cloud.crs import to_wgs84
 from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.crop.crop_cloud import MIN_PART_SHARE, Crop, CropSettings, crop_cloud, parts, whole, without_strays
+from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole, without_strays
 from scenefuse.crop.one_photo import MAX_GROWTH, SceneClicks, crop_grown, locate_clicks
-from scenefuse.crop.vote import Masked, Votes, read_masked_views, vote
+from scenefuse.crop.vote import read_masked_views, vote
 from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
 from scenefuse.marks.triangulation import locate
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
@@ -222,7 +222,8 @@ def crop_linked(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -
         masked = read_masked_views(inputs.workspace, inputs.masks, settings.min_votes)
         (low, high), sight = around_marks(pose.apply(masked.own), settings), masked.sight(pose)
         near = scene.near(np.minimum(low, sight.min(0)), np.maximum(high, sight.max(0)))[1]
-        votes = votes_of(near, masked, pose, settings, len(scene))
+        votes = vote(near.points, masked, pose, settings.min_votes)
+        print(f"{votes.object.sum()} of {len(scene)} scene points by the votes of the masks", flush=True)
         marks, other = np.concatenate([near.points[votes.object], votes.own]), votes.other
         voted = int(votes.object.sum())
     cut = crop_cloud(near, marks, UP, settings, other)
@@ -268,17 +269,6 @@ def _alignment(path: Path) -> Sim3:
             " show its surroundings too, from as far away as the scene's"
         )
     return Sim3.from_matrix(np.array(value(alignment, "scene_from_object")))
-
-
-def votes_of(near: Cloud, masked: Masked, pose: Sim3, settings: CropSettings, scene_points: int) -> Votes:
-    """The masks' votes on the scene's points near the object, without loose parts among those that they vote for."""
-    votes = vote(near.points, masked, pose, settings.min_votes)
-    chosen = np.flatnonzero(votes.object)
-    if len(chosen) > 1:
-        part_of, counts = parts(near.points[chosen], 3 * spacing(near.points[chosen]))
-        chosen = chosen[(counts >= MIN_PART_SHARE * len(chosen))[part_of]]
-    print(f"{len(chosen)} of {scene_points} scene points by the votes of the masks", flush=True)
-    return replace(votes, object=np.isin(np.arange(len(near)), chosen))
 
 
 def crop_marked(
