@@ -245,11 +245,11 @@ def on_ground(points: Array, marks: Array, ground: Ground, in_box: NDArray[np.bo
     return found & in_box
 
 
-def without_strays(points: Array) -> Array:
-    """Points (N, 3) without the outermost along each axis."""
+def without_strays(points: Array, share: float = STRAY_SHARE) -> Array:
+    """Points (N, 3) without the outermost share along each axis."""
     if not len(points):
         return points
-    low, high = np.percentile(points, [100 * STRAY_SHARE, 100 * (1 - STRAY_SHARE)], axis=0)
+    low, high = np.percentile(points, [100 * share, 100 * (1 - share)], axis=0)
     return points[((points >= low) & (points <= high)).all(1)]
 
 

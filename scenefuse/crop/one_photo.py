@@ -11,7 +11,15 @@ from scenefuse.cloud.clouds import Cloud
 from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
-from scenefuse.crop.crop_cloud import LINK_FRACTION, MIN_PART_SHARE, Crop, CropSettings, crop_cloud, without_strays
+from scenefuse.crop.crop_cloud import (
+    LINK_FRACTION,
+    MIN_PART_SHARE,
+    STRAY_SHARE,
+    Crop,
+    CropSettings,
+    crop_cloud,
+    without_strays,
+)
 from scenefuse.marks.clicks import Clicks
 from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
 from scenefuse.photos.workspace import View, read_views
@@ -167,7 +175,7 @@ def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, o
     first = cut = crop_cloud(scene, inside, up, settings, other)
     most = MAX_GROWTH * float(np.linalg.norm(np.ptp(inside, axis=0)))
     for _ in range(MAX_ROUNDS):
-        own = without_strays(scene.points[cut.keep])
+        own = without_strays(scene.points[cut.keep], STRAY_SHARE / 2)  # in each round again
         if not len(own):
             return cut
         if np.linalg.norm(np.ptp(own, axis=0)) > most:

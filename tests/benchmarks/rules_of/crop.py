@@ -201,7 +201,7 @@ RULES = [
     Rule("all clicks outside apart by planes", f"{P}.MAX_VARIATION", constant(0.0)),
     Rule("clicks grow", f"{P}.MAX_ROUNDS", constant(0)),
     Rule("growth is limited", f"{P}.MAX_GROWTH", constant(1e9)),
-    Rule("strays mark nothing when growing", f"{P}.without_strays", lambda _: lambda points: points),
+    Rule("strays mark nothing when growing", f"{P}.without_strays", lambda _: lambda points, _: points),
     Rule("strays mark no foot", f"{C}.STRAY_SHARE", constant(0.0)),
     Rule("ground not over a tenth of the height", f"{C}.FOOT_SHARE", constant(9.0)),
     Rule("ground rises little", f"{C}.MAX_RISE", constant(9.0)),
