@@ -1,5 +1,7 @@
-"""Masks by GrabCut (Rother et al. 2004), seeded by the sparse points of object and background."""
+"""Masks by GrabCut (Rother et al. 2004): one cut, a photo from prompts, and all photos of an object: seeded by prompts
+and sparse points, then cut again along the visual hull."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -9,8 +11,12 @@ from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from scenefuse.geometry.visual_hull import Mask
-from scenefuse.masks.prompts import distance_to
+from scenefuse.core.transforms import Array
+from scenefuse.geometry.visual_hull import Hull, Mask, silhouette
+from scenefuse.marks.photo_clicks import PhotoClicks
+from scenefuse.masks.prompts import POINT_RADIUS_SHARE, Prompts, distance_to, prompted_parts
+from scenefuse.masks.target import Target
+from scenefuse.photos.workspace import Rows, View, Workspace
 
 Trimap = NDArray[np.uint8]
 
@@ -21,8 +27,8 @@ COLOUR_BINS = 32
 SPECK_SHARE, PINHOLE_SHARE = 0.02, 0.0005
 # A hole is one if its colours are twice as frequent around the mask as on it: log 2, in nats.
 GAP_EVIDENCE_NATS = 0.7
-# Pixels along a mask's longer side of which its colours are learnt, and how far around it, as a share of that side.
-COLOURS_WIDTH_PX, SURROUNDINGS_SHARE = 300, 0.1
+# How far around a mask colours are compared with its own, as a share of its longer side.
+SURROUNDINGS_SHARE = 0.1
 # Half width from which the middle of a part differs from its rim; how far a thin part reaches, in bands, beyond what
 # is certain.
 MIN_THIN_HALF_PX, MIN_THIN_BANDS = 1.5, 2.0
@@ -33,6 +39,14 @@ PATH_BLUR_PX, STEP_COST = 0.7, 0.15
 # What is this much nearer to the certain object than to certain background, as a share of both paths, is certain too:
 # on the balloon's photos 0.6 to 0.8 were alike.
 MIN_GROWN_SHARE = 0.7
+# Rounds of learning colours and cutting in the first cut; later ones start from a good mask and take one.
+FIRST_ROUNDS = 4
+# Seeds grow, and the colours of a mask are learnt, in photos at most this wide.
+COARSE_WIDTH_PX = 320
+# Half width of the band along the hull's outline where a photo's own evidence decides, as a share of its width.
+HULL_BAND_SHARE = 5 / 640
+# Outside a clicked box nothing is object from this share of its longer side on: a person's corners miss.
+MAX_BOX_MISS_SHARE = 0.04
 
 
 def first_trimap(size: tuple[int, int], outline_px: NDArray[np.float64], spanning_px: NDArray[np.float64]) -> Trimap:
@@ -236,7 +250,7 @@ def _colours_of(image: NDArray[np.uint8], mask: Mask, unsure: Mask) -> Colours:
     """The colours of a mask (H, W), beside those around it; some thousands of pixels of each are enough."""
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     longest = max(width, height)
-    grow, step = int(SURROUNDINGS_SHARE * longest), max(1, longest // COLOURS_WIDTH_PX)
+    grow, step = int(SURROUNDINGS_SHARE * longest), max(1, longest // COARSE_WIDTH_PX)
     near = np.s_[max(0, y - grow) : y + height + grow : step, max(0, x - grow) : x + width + grow : step]
     return learn_colours([image[near]], [mask[near]], [~mask[near] & ~unsure[near]])
 
@@ -246,3 +260,124 @@ def fill_hull(canvas: NDArray[np.uint8], points: NDArray[np.float64], value: int
     # cv2 draws with 16-bit coordinates internally: far-away corners are clipped to a frame around the photo.
     clipped = np.clip(points, -4 * max(canvas.shape), 5 * max(canvas.shape)).astype(np.int32)
     cv2.fillConvexPoly(canvas, cv2.convexHull(clipped.reshape(-1, 1, 2)), value)
+
+
+def first_cuts(target: Target, photos: Workspace, width_px: int, clicked: Mapping[int, PhotoClicks]) -> list[Mask]:
+    """First masks (H, W), seeded by the prompts and the sparse points.
+
+    Args:
+        target: box, prompts and sparse points of the object.
+        photos: views with RGB pixels.
+        width_px: photos are cut at most this wide.
+        clicked: clicks by row of the photo.
+    """
+    masks = []
+    for k, (view, seen, seen_at) in enumerate(zip(photos.views, photos.seen, photos.seen_at)):
+        outline, spanning = target.outline(view), view.project(target.spanning)[0]
+        trimap = first_trimap((view.height, view.width), outline, spanning)
+        stamp(trimap, target, view, seen, seen_at, clicked.get(k))
+        if clicked:
+            grow_seeds(view.pixels, trimap, COARSE_WIDTH_PX)
+        masks.append(cleaned(grabcut(view.pixels, trimap, width_px, FIRST_ROUNDS)))
+    return masks
+
+
+def query_grabcut(width_px: int, view: View, prompts: Prompts, box: Array | None) -> tuple[list[Mask], Array]:
+    """One mask (H, W) of a photo by GrabCut, and its quality: 1, or 0 where it is empty or all of the photo.
+
+    Args:
+        width_px: photos are cut at most this wide.
+        view: the photo, with RGB pixels.
+        prompts: what those inside span is likely object.
+        box: (2, 2) corners of a box, upper left first, outside of which nothing is object; or None.
+    """
+    on, off = prompts.inside, prompts.outside
+    trimap = np.full((view.height, view.width), cv2.GC_PR_BGD, dtype=np.uint8)
+    if box is not None:
+        trimap[_off_box(trimap, box, MAX_BOX_MISS_SHARE)] = cv2.GC_BGD
+        trimap[~_off_box(trimap, box, 0)] = cv2.GC_PR_FGD
+    elif len(on) >= 3:
+        fill_hull(trimap, on, cv2.GC_PR_FGD)
+    _discs(trimap, off, on, POINT_RADIUS_SHARE * max(view.width, view.height))
+    grow_seeds(view.pixels, trimap, COARSE_WIDTH_PX)
+    mask = cleaned(grabcut(view.pixels, trimap, width_px, FIRST_ROUNDS))
+    return [mask], np.array([float(mask.any() and not mask.all())])
+
+
+def _off_box(trimap: Trimap, box: Array, slack: float) -> Mask:
+    """(H, W) what lies outside a box (2, 2) in pixels, grown on all sides by a share of its longer side."""
+    grow = slack * float((box[1] - box[0]).max())
+    (left, top), (right, bottom) = np.maximum(box + [[-grow], [grow]], 0).astype(int)
+    off = np.ones(trimap.shape, dtype=bool)
+    off[top : bottom + 1, left : right + 1] = False
+    return off
+
+
+def _discs(trimap: Trimap, off: Array, on: Array, radius_px: float) -> None:
+    """Make the discs around pixels (M, 2) off the object and (N, 2) on it certain, in place."""
+    for pixels, label in ((off, cv2.GC_BGD), (on, cv2.GC_FGD)):
+        for x, y in pixels.astype(int):
+            cv2.circle(trimap, (int(x), int(y)), max(1, round(radius_px)), label, -1)
+
+
+def second_cuts(
+    target: Target,
+    masks: list[Mask],
+    photos: Workspace,
+    hull: Hull,
+    clicked: Mapping[int, PhotoClicks],
+) -> list[Mask]:
+    """GrabCut once more, where a photo's mask and the hull do not agree.
+
+    Args:
+        target: box, prompts and sparse points of the object.
+        masks: (H, W) per photo.
+        photos: views with RGB pixels.
+        hull: of these masks.
+        clicked: clicks by row of the photo.
+    """
+    outlines = [silhouette(hull, view) for view in photos.views]
+    own, others = [m & o for m, o in zip(masks, outlines)], [~m & ~o for m, o in zip(masks, outlines)]
+    colours = learn_colours([view.pixels for view in photos.views], own, others)
+    cut = []
+    for k, (view, mask, outline) in enumerate(zip(photos.views, masks, outlines)):
+        trimap = second_trimap(outline, mask, colours.evidence(view.pixels), HULL_BAND_SHARE * view.width)
+        stamp(trimap, target, view, photos.seen[k], photos.seen_at[k], clicked.get(k))
+        if not outline.any():
+            cut.append(outline)
+            continue
+        found, told = grabcut(view.pixels, trimap, view.width, 1), clicked.get(k)
+        cut.append(cleaned(found))
+        if told is not None and len(told.on):
+            # A small part that was clicked is no speck.
+            cut[-1] = cut[-1] | prompted_parts(found, told.on, told.off)
+    return cut
+
+
+def stamp(
+    trimap: Trimap, target: Target, view: View, seen: Rows, seen_at: Array, clicks: PhotoClicks | None = None
+) -> None:
+    """Mark in place what the sparse points that a photo sees make certain, the prompts, what close prompts enclose, and
+    the photo's own clicks and box.
+
+    A prompt that the photo does not see is hidden by the object itself, so its pixel is the object's all the same.
+
+    Args:
+        trimap: (H, W) labels.
+        target: box, prompts and sparse points of the object.
+        view: the photo.
+        seen: (K,) rows of the sparse points that it observes.
+        seen_at: (K, 2) pixels where it does.
+        clicks: made in this photo, if any.
+    """
+    radius, kind = POINT_RADIUS_SHARE * max(view.width, view.height), target.kind[seen]
+    _discs(trimap, seen_at[kind < 0], seen_at[kind > 0], radius)
+    pixels, depth = view.project(target.spanning)
+    for part in [*target.parts, *np.arange(len(pixels))[:, None]]:
+        if (depth[part] > 0).all():
+            fill_hull(trimap, pixels[part], cv2.GC_FGD)
+    if clicks is None:
+        return
+    if clicks.box is not None:
+        trimap[_off_box(trimap, clicks.box, MAX_BOX_MISS_SHARE)] = cv2.GC_BGD
+    _discs(trimap, clicks.off, clicks.on, radius)

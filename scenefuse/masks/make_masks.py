@@ -29,7 +29,8 @@ from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.sam2_weights import why_unavailable
 from scenefuse.masks.segmentation import MaskSettings, ScoredMasks, score_masks
 from scenefuse.masks.supplied import supplied_masks
-from scenefuse.masks.target import points_in_masks, target_from_points
+from scenefuse.masks.target import target_from_points
+from scenefuse.masks.votes import points_in_masks
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.pictures import write_picture
 from scenefuse.photos.workspace import View, Workspace, read_workspace
@@ -130,13 +131,13 @@ def _make(
         found = masks_from_prompts(marked, inputs.sparse, sizes, photos, up, network, settings, seed)
     own = found.target.kind
     print(f"{np.sum(own > 0)} points on the object, {np.sum(own < 0)} not", flush=True)
-    scored = score_masks(found.masks, found.target, photos.views, settings)
+    scored = score_masks(found.masks, found.target, photos.views, settings, found.clicked)
     for name in set(scored.dropped) & set(found.reasons):
         scored.dropped[name] += f"; {found.reasons[name]}"
-    against = sorted(set(scored.dropped) & set(found.clicked) - set(found.reasons))
+    against = sorted(name for name in found.clicked if scored.scores[name] < settings.min_agreement)
     if against:
         note = (
-            f"the masks carried on from the clicks in {', '.join(against)} contradict the masks there: they lack a"
+            f"the masks propagated from the clicks in {', '.join(against)} contradict the masks there: they lack a"
             " part of the object, or hold more than it; look at them, and click in a photo where they are wrong"
         )
         found = replace(found, notes=(*found.notes, note))
@@ -213,6 +214,7 @@ def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str], se
     """What the stage found, without its files."""
     per_photo = {
         name: {"area": round(float(mask.mean()), 5), "agreement": round(float(made.scores[name]), 4)}
+        | ({"quality": round(found.quality[name], 4)} if name in found.quality else {})
         for name, mask in made.masks.items()
     }
     return {

@@ -1,7 +1,7 @@
 """Masks from prompts: points triangulated from several photos, or clicks in one, carried on to the others."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -12,9 +12,9 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.clicks import Clicks, ScenePoints
-from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
+from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks, clicks_per_photo
 from scenefuse.marks.triangulation import marked_size, triangulate_consistent
-from scenefuse.masks.grabcut_passes import query_grabcut
+from scenefuse.masks.grabcut import query_grabcut
 from scenefuse.masks.prompts import Segmenter, prompted_parts
 from scenefuse.masks.propagation import propagate
 from scenefuse.masks.sam2 import Sam2, query_sam2
@@ -23,8 +23,6 @@ from scenefuse.masks.stereo_points import with_stereo_points
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
 from scenefuse.photos.workspace import Workspace, read_model
 
-# Points clicked in several photos that span an object.
-MIN_POINTS = 3
 # Clicks on a point that miss each other by this share of what is clicked still say where the object ends: corners that
 # a hand misses, or that are none (a hat's brim).
 MAX_MISS_SHARE = 0.03
@@ -43,7 +41,8 @@ class Prompted:
         reasons: why a photo's mask was not good enough to be carried on, by the photo's name.
         left_out: clicks that contradict the others, or whose photo has no camera, a sentence each.
         notes: what else a user should know of the clicks.
-        clicked: names of the photos whose masks come from clicks in them.
+        clicked: names of the photos whose masks come from clicks in them alone.
+        quality: of the masks by SAM 2's own estimate, by the photo's name.
     """
 
     masks: list[Mask]
@@ -52,6 +51,7 @@ class Prompted:
     left_out: list[str]
     notes: tuple[str, ...] = ()
     clicked: tuple[str, ...] = ()
+    quality: Mapping[str, float] = field(default_factory=dict)
 
 
 def masks_from_prompts(
@@ -92,7 +92,8 @@ def masks_from_prompts(
             masks = segment_by_grabcut(target, photos, settings, found.clicked)
         masks = [_own_parts(mask, target, photos, k, found.clicked.get(k)) for k, mask in enumerate(masks)]
         names = tuple(photos.views[k].name for k, clicks in found.clicked.items() if clicks.enough)
-        return Prompted(masks, target, found.reasons, left_out + found.left_out, clicked=names)
+        left_out += found.left_out
+        return Prompted(masks, target, found.reasons, left_out, clicked=names, quality=found.quality)
     points, exact, left_out, notes = _points(marked, sparse, sizes, settings.max_click_residual_px)
     target = replace(target_from_points(points, photos, up, seed), inexact=np.flatnonzero(~exact))
     if network:
@@ -131,7 +132,7 @@ def _points(
                 f"the clicks on {len(off)} of {len(names)} points miss each other by more than {max_residual_px:g} px"
                 f" ({', '.join(off)}): these points say how far the object reaches, and do not prompt SAM 2",
             )
-    if len(points) < MIN_POINTS:
+    if len(points) < SUFFICIENT_CLICKS:
         wrong = f" ({'; '.join(left_out)})" if left_out else ""
         raise StageError(
             f"{marked.path} holds {len(names)} points on the object that can be used, three or more are needed{wrong};"

@@ -12,6 +12,9 @@ from scenefuse.geometry.visual_hull import Mask
 from scenefuse.photos.workspace import View
 
 NO_PIXELS: Array = np.zeros((0, 2))
+# How far a point's pixel may be off, as a share of the photo's longer side, about two pixels at 640: a disc of this
+# radius is certain, and points this near an outline do not vote.
+POINT_RADIUS_SHARE = 0.003
 
 
 class Prompts(NamedTuple):
@@ -22,14 +25,12 @@ class Prompts(NamedTuple):
         clicked_off: clicked off it.
         known: of points that other photos' masks hold to be the object's.
         known_off: of points that they hold not to be.
-        enclosed: of points that are perhaps the object's, as its own enclose them; they prompt parts only.
     """
 
     clicked: Array = NO_PIXELS
     clicked_off: Array = NO_PIXELS
     known: Array = NO_PIXELS
     known_off: Array = NO_PIXELS
-    enclosed: Array = NO_PIXELS
 
     @property
     def inside(self) -> Array:

@@ -11,12 +11,19 @@ from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks
 from scenefuse.masks.grabcut import cleaned
-from scenefuse.masks.parts import MIN_KNOWN_POINTS, with_parts
-from scenefuse.masks.prompts import Prompts, Segmenter, agreement, distance_to, held, pixel_of, prompted_parts
+from scenefuse.masks.prompts import (
+    NO_PIXELS,
+    Prompts,
+    Segmenter,
+    agreement,
+    distance_to,
+    held,
+    pixel_of,
+    prompted_parts,
+)
 from scenefuse.masks.votes import (
     MIN_AGREEMENT,
-    MIN_QUALITY,
-    MIN_VOTE_SHARE,
+    MIN_KNOWN_POINTS,
     Voter,
     agrees_with_others,
     known_pixels,
@@ -31,6 +38,10 @@ QUALITY_WEIGHT = 0.3
 # For several clicks alone, where no mask has this quality, the largest is taken of those that score less by no more
 # than this: who clicks on several parts means the whole.
 CERTAIN_QUALITY, SCORE_MARGIN = 0.9, 0.06
+# Times that a photo is prompted again, with a known point on which its mask is wrong.
+CORRECTIONS = 3
+# A pixel off a mask by less than this share of the photo's longer side missed its outline; others are on a part.
+NEAR_MISS_SHARE = 0.015
 
 NO_CLICKS = PhotoClicks(np.zeros((0, 2)), np.zeros(0, dtype=bool))
 
@@ -45,6 +56,7 @@ class Propagated:
         kind: (P,) per sparse point, 1 on the object, -1 not on it, 0 unknown.
         left_out: the clicks that contradict their mask, a sentence each.
         clicked: the others, by row of the photo.
+        quality: of each photo's mask by the segmenter's own estimate, by the photo's name.
     """
 
     masks: list[Mask]
@@ -52,6 +64,7 @@ class Propagated:
     kind: NDArray[np.int8]
     left_out: list[str]
     clicked: dict[int, PhotoClicks]
+    quality: dict[str, float]
 
 
 def propagate(
@@ -61,9 +74,8 @@ def propagate(
 
     Photos with three clicks or a box come first, those with most clicks before. Then always the photo that sees most
     points known to be the object's, so that the masks go round the object both ways; one with clicks is prompted by
-    these too. A mask of low quality, or one that contradicts what prompted it, does not vote. All that do not, or that
-    the others contradict in the end, are made once more from the votes of all others; all get the parts that they lack
-    by these.
+    these too. A mask that contradicts what prompted it does not vote. All that do not, or that the others contradict in
+    the end, are made once more from the votes of all others; but no other photo overrules three clicks or a box.
 
     Args:
         segment: SAM 2 or GrabCut.
@@ -89,11 +101,9 @@ def propagate(
         _refuse(photos, made, left_out)
     for k in range(len(photos.views)):
         others = {row: voter for row, voter in made.items() if row != k}
-        if k not in made or not made[k].votes or not agrees_with_others(photos, k, made[k].mask, others):
+        settled = k in made and made[k].votes and agrees_with_others(photos, k, made[k].mask, others)
+        if not settled and not (k in made and made[k].final):
             make(k, " again")
-    for k in [k for k in range(len(photos.views)) if made[k].votes]:
-        others = {row: voter for row, voter in made.items() if row != k}
-        made[k] = _extended(segment, photos, k, made[k], others, tolerance_px)
     return _propagated(photos, made, [note for _, notes in sorted(left_out.items()) for note in notes])
 
 
@@ -102,7 +112,7 @@ def _next(photos: Workspace, made: dict[int, Voter], clicked: dict[int, PhotoCli
     clicks before the others; else one with fewer clicks; None where nothing says what the object is."""
     left = [k for k in range(len(photos.views)) if k not in made]
     shares = vote_shares(photos, made)
-    known = {k: int((shares[photos.seen[k]] >= MIN_VOTE_SHARE).sum()) for k in left}
+    known = {k: int((shares[photos.seen[k]] >= MIN_AGREEMENT).sum()) for k in left}
     prompted = [k for k in left if known[k] >= MIN_KNOWN_POINTS]
     alone = [k for k in left if k in clicked and clicked[k].enough]
     if prompted and not alone:
@@ -138,7 +148,7 @@ def _make(
         kept = clicks.only(keep)
         if len(known.known) < MIN_KNOWN_POINTS and not kept.prompt:
             break
-        prompts = known._replace(clicked=kept.on, clicked_off=kept.off)
+        prompts = known._replace(clicked=kept.on, clicked_off=np.concatenate([kept.off, known.clicked_off]))
         voter = voter_of(photos, k, *best_mask(segment, view, prompts, clicks.box, tolerance_px), kept)
         wrong = keep & ~_held_clicks(voter.mask, clicks, tolerance_px)
         if not wrong.any():
@@ -158,24 +168,14 @@ def _held_clicks(mask: Mask, clicks: PhotoClicks, tolerance_px: float) -> NDArra
     return np.where(clicks.inside, held(mask, clicks.pixels, tolerance_px), held(~mask, clicks.pixels, tolerance_px))
 
 
-def _extended(
-    segment: Segmenter, photos: Workspace, k: int, voter: Voter, others: dict[int, Voter], tolerance_px: float
-) -> Voter:
-    """A photo's mask with the parts that it lacks by the votes of all others."""
-    prompts = known_pixels(photos, k, others)._replace(clicked=voter.clicks.on, clicked_off=voter.clicks.off)
-    mask = with_parts(segment, photos.views[k], voter.mask, prompts, tolerance_px)
-    if (mask == voter.mask).all():
-        return voter
-    print(f"{photos.views[k].name}: {mask.sum() / voter.mask.sum() - 1:.1%} added", flush=True)
-    return voter_of(photos, k, mask, voter.quality, agreement(mask, prompts, tolerance_px), voter.clicks)
-
-
 def best_mask(
     segment: Segmenter, view: View, prompts: Prompts, box: Array | None, tolerance_px: float
 ) -> tuple[Mask, float, float]:
-    """The best of the masks for prompts, without the parts of it that hold none, with those that prompt alone.
+    """The best of the masks for prompts, without the parts of it that hold none, with clicked parts that prompt alone.
 
-    For several clicks alone the largest of those about as good, if the segmenter is certain of none.
+    A mask that agrees with more clicks is better, whatever its quality. For several clicks alone the largest of those
+    about as good is taken, if the segmenter is certain of none. Where the best is wrong on several known points, well
+    beside its outline, the middle one of these prompts as if a person had clicked on it.
 
     Args:
         segment: SAM 2 or GrabCut.
@@ -187,22 +187,61 @@ def best_mask(
     Returns:
         The mask (H, W); its quality by the segmenter's own estimate, 0 where it is empty; its agreement.
     """
-    masks, quality = segment(view, prompts, box)
-    masks = [prompted_parts(cleaned(mask, view.pixels), prompts.inside, prompts.outside) for mask in masks]
-    scores = np.array([agreement(mask, prompts, tolerance_px) - 2 * (not mask.any()) for mask in masks])
-    scores += QUALITY_WEIGHT * quality
-    best = int(scores.argmax())
-    if not len(prompts.known) and len(prompts.clicked) >= SUFFICIENT_CLICKS and quality[best] < CERTAIN_QUALITY:
-        best = int(max(np.flatnonzero(scores > scores[best] - SCORE_MARGIN), key=lambda row: masks[row].sum()))
-    mask = with_parts(segment, view, masks[best], prompts, tolerance_px)
-    return mask, float(quality[best]) * bool(mask.any()), agreement(mask, prompts, tolerance_px)
+    clicks, asked = Prompts(prompts.clicked, prompts.clicked_off), prompts
+    reach_px = max(tolerance_px, NEAR_MISS_SHARE * max(view.height, view.width))
+    found: list[tuple[tuple[float, float], Mask, float]] = []
+    for _ in range(1 + CORRECTIONS):
+        for mask, quality in zip(*segment(view, asked, box)):
+            mask = prompted_parts(cleaned(mask, view.pixels), prompts.inside, prompts.outside)
+            if mask.any():
+                score = agreement(mask, prompts, tolerance_px) + QUALITY_WEIGHT * float(quality)
+                found.append(((agreement(mask, clicks, tolerance_px), score), mask, float(quality)))
+        if not found:
+            return np.zeros((view.height, view.width), dtype=bool), 0.0, 0.0
+        rank, best, quality = max(found, key=lambda one: one[0])
+        missed, taken = _deep(prompts.known, ~best, reach_px), _deep(prompts.known_off, best, reach_px)
+        if not len(missed) and not len(taken):
+            break
+        asked = asked._replace(
+            clicked=np.concatenate([asked.clicked, missed]), clicked_off=np.concatenate([asked.clicked_off, taken])
+        )
+    if not len(prompts.known) and len(prompts.clicked) >= SUFFICIENT_CLICKS and quality < CERTAIN_QUALITY:
+        alike = [one for one in found if one[0][0] == rank[0] and one[0][1] > rank[1] - SCORE_MARGIN]
+        _, best, quality = max(alike, key=lambda one: one[1].sum())
+    mask = _with_clicked_parts(segment, view, best, prompts, reach_px)
+    return mask, quality, agreement(mask, prompts, tolerance_px)
+
+
+def _deep(pixels: Array, side: Mask, reach_px: float) -> Array:
+    """The middle one, (1, 2), of (N, 2) pixels that lie deeper than this in a side (H, W) of an outline; (0, 2) where
+    there are few: single points may be mismatched."""
+    u, v = pixel_of(pixels, side)
+    wrong = pixels[distance_to(~side)[v, u] > reach_px]
+    middle = np.linalg.norm(wrong - np.median(wrong, axis=0), axis=1).argmin() if len(wrong) else 0
+    return wrong[[middle]] if len(wrong) >= MIN_KNOWN_POINTS else NO_PIXELS
+
+
+def _with_clicked_parts(segment: Segmenter, view: View, mask: Mask, prompts: Prompts, reach_px: float) -> Mask:
+    """A mask (H, W) with the parts that were clicked and that it lacks: prompted on several things, SAM 2 returns only
+    the clearest. Each click alone prompts its part, which is no larger than the mask and holds no click outside."""
+    whole = mask
+    if held(mask, prompts.clicked, reach_px).any():
+        for click in prompts.clicked[~held(mask, prompts.clicked, reach_px), None]:
+            if held(whole, click, 0).all():
+                continue
+            masks, quality = segment(view, Prompts(click, prompts.clicked_off), None)
+            for row in np.argsort(-quality):
+                part = prompted_parts(cleaned(masks[row], view.pixels), click, prompts.clicked_off)
+                if 0 < part.sum() <= mask.sum() and not held(part, prompts.clicked_off, 0).any():
+                    whole = whole | part
+                    break
+    return whole
 
 
 def _refuse(photos: Workspace, made: dict[int, Voter], left_out: dict[int, list[str]]) -> None:
     """Say why no photo has a mask to begin with."""
     about = "; ".join(
-        f"{photos.views[k].name}: quality {voter.quality:.2f} (least {MIN_QUALITY}), agreement with the clicks"
-        f" {voter.agreement:.2f} (least {MIN_AGREEMENT})"
+        f"{photos.views[k].name}: agreement with the clicks {voter.agreement:.2f} (least {MIN_AGREEMENT})"
         for k, voter in made.items()
     )
     wrong = "".join(f"; {note}" for notes in left_out.values() for note in notes)
@@ -216,11 +255,11 @@ def _propagated(photos: Workspace, made: dict[int, Voter], left_out: list[str]) 
         masks.append(made[k].mask if made[k].votes else np.zeros((view.height, view.width), dtype=bool))
         if not made[k].votes:
             reasons[view.name] = (
-                f"the mask from the clicks has quality {made[k].quality:.2f} (least {MIN_QUALITY}) and agrees with"
-                f" {made[k].agreement:.2f} of its prompts (least {MIN_AGREEMENT})"
+                f"the mask from the clicks agrees with {made[k].agreement:.2f} of its prompts (least {MIN_AGREEMENT})"
             )
     counts = np.bincount(np.concatenate([v.rows for v in made.values() if v.votes]), minlength=len(photos.points))
-    kind, _ = known_points(photos, made)
+    kind = known_points(photos, made)
     kind[counts < 3] = 0
     clicked = {k: voter.clicks for k, voter in made.items() if voter.clicks is not NO_CLICKS}
-    return Propagated(masks, reasons, kind, left_out, clicked)
+    quality = {photos.views[k].name: voter.quality for k, voter in sorted(made.items())}
+    return Propagated(masks, reasons, kind, left_out, clicked, quality)

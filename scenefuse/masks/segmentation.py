@@ -9,16 +9,16 @@ import numpy as np
 from scenefuse.core.stage import StageError, setting
 from scenefuse.geometry.visual_hull import Hull, Mask, carve, mask_iou, silhouette
 from scenefuse.marks.photo_clicks import PhotoClicks
-from scenefuse.masks.grabcut import along_edges, cleaned
-from scenefuse.masks.grabcut_passes import first_cuts, second_cuts
+from scenefuse.masks.grabcut import along_edges, cleaned, first_cuts, second_cuts
 from scenefuse.masks.sam2 import LOGITS_PX, Sam2, segment
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.masks.target import Target
 from scenefuse.photos.workspace import View, Workspace
 
 # Share of the photos that may contradict a voxel of the hull, as some masks are wrong somewhere: of the last masks, of
-# first masks, which are made photo by photo, and for the hull by which masks are trusted.
-MAX_WRONG_SHARE, MAX_WRONG_FIRST_SHARE, MAX_WRONG_UNTRUSTED_SHARE = 0.1, 0.2, 0.34
+# first masks, which are made photo by photo, and for another hull by which masks are compared: where many lack the same
+# part, they would carve it away.
+MAX_WRONG_SHARE, MAX_WRONG_FIRST_SHARE, MAX_LACKING_SHARE = 0.1, 0.2, 0.34
 # Share of the median mask's agreement with the hull below which SAM 2 makes a mask once more.
 MIN_SHARE_OF_MEDIAN = 0.9
 NOTHING: Mapping[int, PhotoClicks] = {}
@@ -82,7 +82,7 @@ def segment_by_grabcut(
     """
     masks = first_cuts(target, photos, settings.grabcut_width_px, clicked)
     for tolerance in (MAX_WRONG_FIRST_SHARE, MAX_WRONG_SHARE):
-        hull = carve_trusted(target, photos.views, masks, settings, tolerance)
+        hull = carve_consistent(target, photos.views, masks, settings, tolerance)
         masks = second_cuts(target, masks, photos, hull, clicked)
     return masks
 
@@ -102,14 +102,14 @@ def segment_again(
     clicked: Mapping[int, PhotoClicks] = NOTHING,
 ) -> list[Mask]:
     """SAM 2 once more, with the visual hull's box and the photo's own clicks, where one of the masks (H, W) disagrees
-    with the hull, or much more than most; then all of them at the photo's resolution."""
+    with the hull, or much more than most, unless clicks alone suffice for it; then all at the photo's resolution."""
     masks = list(masks)
-    hull = carve_trusted(target, photos.views, masks, settings, MAX_WRONG_FIRST_SHARE)
+    hull = carve_consistent(target, photos.views, masks, settings, MAX_WRONG_FIRST_SHARE)
     outlines = [silhouette(hull, view) for view in photos.views]
     agreement = [mask_iou(mask, outline) for mask, outline in zip(masks, outlines)]
     least = max(settings.min_agreement, MIN_SHARE_OF_MEDIAN * float(np.median(agreement)))
     for k, (view, outline) in enumerate(zip(photos.views, outlines)):
-        if agreement[k] < least:
+        if agreement[k] < least and not (masks[k].any() and k in clicked and clicked[k].enough):
             again = segment(network, target, view, outline, clicked.get(k))
             if mask_iou(again, outline) > agreement[k]:
                 masks[k] = again
@@ -126,37 +126,49 @@ def _at_full_size(view: View, mask: Mask) -> Mask:
     return np.asarray(cleaned(edges, view.pixels) | (edges & asked))
 
 
-def score_masks(masks: list[Mask], target: Target, views: list[View], settings: MaskSettings) -> ScoredMasks:
-    """The masks of V views with their agreement with their visual hull; empty and contradicting ones are dropped."""
-    hull = carve_trusted(target, views, masks, settings, MAX_WRONG_SHARE)
+def score_masks(
+    masks: list[Mask], target: Target, views: list[View], settings: MaskSettings, clicked: tuple[str, ...] = ()
+) -> ScoredMasks:
+    """The masks of V views with their agreement with their visual hull; empty and contradicting ones are dropped, but
+    not those that a person clicked, by the names of their photos."""
+    hull = carve_consistent(target, views, masks, settings, MAX_WRONG_SHARE)
     scores = {view.name: mask_iou(mask, silhouette(hull, view)) for view, mask in zip(views, masks)}
     dropped = {}
     for view, mask in zip(views, masks):
         if not mask.any():
             dropped[view.name] = "empty mask"
-        elif scores[view.name] < settings.min_agreement:
+        elif scores[view.name] < settings.min_agreement and view.name not in clicked:
             dropped[view.name] = f"IoU with the visual hull is {scores[view.name]:.2f}, below {settings.min_agreement}"
     return ScoredMasks({view.name: mask for view, mask in zip(views, masks)}, scores, dropped, hull)
 
 
-def carve_trusted(
+def carve_consistent(
     target: Target, views: list[View], masks: list[Mask], settings: MaskSettings, tolerance: float
 ) -> Hull:
-    """The visual hull of the masks (H, W) that a tolerant hull of all of them does not contradict.
+    """The visual hull of the largest set of masks (H, W) that agree with the hull of their set.
+
+    A strict hull of all masks is too small where some lack a part, a tolerant one too large where few photos bound it;
+    the set that begins with the one or the other is taken.
 
     Raises:
         StageError: the masks have nothing in common.
     """
-    trusted = [replace(view, pixels=mask) for view, mask in zip(views, masks) if mask.any()]
-    hull: Hull | None = None
-    for share in (max(tolerance, MAX_WRONG_UNTRUSTED_SHARE), tolerance):
-        if hull is not None:
-            trusted = [v for v in trusted if mask_iou(v.pixels, silhouette(hull, v)) >= settings.min_agreement]
-        if len(trusted) < 2:
-            hull = None
-            break
-        own = target.sparse[target.kind > 0]
-        hull = carve(target.box, target.ground.height_of, trusted, settings.hull_voxels, share, own)
+    shown = [replace(view, pixels=mask) for view, mask in zip(views, masks) if mask.any()]
+    own = target.sparse[target.kind > 0]
+
+    def carved(among: list[View], voxels: int, share: float) -> Hull:
+        return carve(target.box, target.ground.height_of, among, voxels, share, own)
+
+    def agreeing(hull: Hull) -> list[View]:
+        return [view for view in shown if mask_iou(view.pixels, silhouette(hull, view)) >= settings.min_agreement]
+
+    largest: list[View] = []
+    coarse = settings.hull_voxels // 2  # enough to compare by, in an eighth of the time
+    for share in (MAX_LACKING_SHARE, tolerance):
+        chosen = agreeing(carved(shown, coarse, share)) if len(shown) > 1 else []
+        consistent = agreeing(carved(chosen, coarse, tolerance)) if len(chosen) > 1 else []
+        largest = max(largest, consistent, key=len)
+    hull = carved(largest, settings.hull_voxels, tolerance) if len(largest) > 1 else None
     if hull is None or len(hull.shell) == 0:
         raise StageError(
             "the masks of the photos have no common object; check that the prompts lie on one object and span it, "

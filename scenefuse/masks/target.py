@@ -2,17 +2,16 @@
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay
+from scipy.spatial import ConvexHull, Delaunay
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.ground import Ground
-from scenefuse.geometry.visual_hull import NO_POINTS, Box, Mask
-from scenefuse.masks.box import GROUND_SCATTER_SHARE, find_ground, in_hull, span, upright_box
+from scenefuse.geometry.ground import Ground, fit_ground
+from scenefuse.geometry.visual_hull import NO_POINTS, Box
 from scenefuse.masks.prompts import far_apart
-from scenefuse.masks.votes import MIN_VOTE_SHARE, without_outermost
 from scenefuse.photos.workspace import View, Workspace
 
 # Growth of the box of the object's points on each side, as a share of its diagonal: they seldom mark its ends.
@@ -22,6 +21,12 @@ BOX_MARGIN_SHARE = 0.15
 MAX_PART_EDGE_SHARE = 0.12
 # Sparse points, far apart, that stand for the object where masks voted for thousands.
 SPANNING_POINTS = 64
+# Ground is looked for so far beside the box, in half widths of it: farther off it may be another level.
+GROUND_REACH_HALF_WIDTHS = 1.5
+# How far a ground point may lie off the fitted surface, as a share of the box's diagonal: grass, gravel, errors of SfM.
+GROUND_SCATTER_SHARE = 0.02
+# Percentage of the object's points at each side, along each axis, that may be mismatched.
+OUTERMOST_PERCENT = 1.0
 # Sparse points on the object that masks have to hold: fewer do not show its extent.
 MIN_OBJECT_POINTS = 10
 
@@ -120,26 +125,6 @@ def target_from_votes(
     )
 
 
-def points_in_masks(photos: Workspace, masks: list[Mask]) -> Array:
-    """(N, 3) sparse points that lie in the photos' masks (H, W) wherever they are seen, without the outermost.
-
-    Raises:
-        StageError: there are fewer than ten of them.
-    """
-    seen, hit = np.zeros(len(photos.points)), np.zeros(len(photos.points))
-    for rows, pixels, mask in zip(photos.seen, photos.seen_at, masks):
-        u, v = np.clip(pixels.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
-        np.add.at(seen, rows, 1)
-        np.add.at(hit, rows, mask[v, u])
-    own = photos.points[(seen >= 2) & (hit > MIN_VOTE_SHARE * seen)]
-    if len(own) < MIN_OBJECT_POINTS:
-        raise StageError(
-            f"only {len(own)} sparse points lie in the supplied masks; "
-            "are they white on the object, and of these photos?"
-        )
-    return without_outermost(own)
-
-
 def _parts(points: Array, max_edge: float) -> NDArray[np.intp]:
     """(K, 4) rows of (N, 3) prompts, tetrahedra with short edges: close clicks mark the corners of a small part."""
     if len(points) < 5:
@@ -147,3 +132,71 @@ def _parts(points: Array, max_edge: float) -> NDArray[np.intp]:
     corners = Delaunay(points, qhull_options="Qbb Qc QJ").simplices.astype(np.intp)
     edges = np.linalg.norm(points[corners][:, :, None] - points[corners][:, None], axis=-1)
     return corners[edges.max((1, 2)) < max_edge]
+
+
+def without_outermost(points: Array) -> Array:
+    """Of (N, 3) points of the object those that are not the outermost along an axis, where there are many."""
+    if not len(points):
+        return points
+    low = np.percentile(points, OUTERMOST_PERCENT, axis=0, method="lower")
+    high = np.percentile(points, 100 - OUTERMOST_PERCENT, axis=0, method="higher")
+    return points[((points >= low) & (points <= high)).all(1)]
+
+
+def upright_box(points: Array, up: Array, margin: float) -> Box:
+    """The smallest upright box around (N, 3) points, its third axis along `up`, grown on all sides.
+
+    Args:
+        points: points on the object, at least two, in the object's frame.
+        up: (3,) the direction against gravity.
+        margin: growth on each side, as a share of the diagonal of the box of the points.
+    """
+    z = up / np.linalg.norm(up)
+    x = np.cross(z, [1.0, 0, 0] if abs(z[0]) < 0.9 else [0, 1.0, 0])
+    x /= np.linalg.norm(x)
+    axes = np.stack([x, np.cross(z, x), z], axis=1)
+    flat = points @ axes
+    if len(points) >= 3:
+        angle = np.radians(cv2.minAreaRect(flat[:, :2].astype(np.float32))[2])
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        axes = axes @ turn
+        flat = points @ axes
+    low, high = flat.min(0), flat.max(0)
+    grow = margin * np.linalg.norm(high - low)
+    return Box(np.column_stack([axes, np.zeros(3)]), low - grow, high + grow)
+
+
+def find_ground(points_in_box: Array, box: Box, prompts_in_box: Array, seed: int) -> tuple[Ground, bool]:
+    """The ground beside the object, and whether it was found; otherwise it is the bottom of the box.
+
+    No prompt lies below it: where one would, the ground is lowered.
+
+    Args:
+        points_in_box: (N, 3) sparse points along the box's axes.
+        box: the object's box.
+        prompts_in_box: (M, 3) prompts along the box's axes.
+        seed: seed of RANSAC's samples.
+    """
+    ring = GROUND_REACH_HALF_WIDTHS * float((box.high - box.low)[:2].max()) / 2
+    low_enough = points_in_box[points_in_box[:, 2] < box.high[2]]
+    ground = fit_ground(low_enough, box.low, box.high, ring, GROUND_SCATTER_SHARE * box.diagonal, seed)
+    if ground is None:
+        return Ground(np.array([box.low[2], 0, 0, 0, 0, 0]), (box.low + box.high)[:2] / 2), False
+    ground.coefficients[0] += min(0.0, float(ground.height_of(prompts_in_box).min()))
+    return ground, True
+
+
+def span(points: Array, margin: float) -> Array:
+    """(M, 3) points whose convex hull is that of (N, 3) points, grown by `margin` on all sides."""
+    steps = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.float64)
+    steps /= np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1)
+    return (points[:, None] + margin * steps).reshape(-1, 3)
+
+
+def in_hull(points: Array, corners: Array) -> NDArray[np.bool_]:
+    """(N,) True where (N, 3) points lie in the convex hull of (M, 3) corners."""
+    hull = ConvexHull(corners)
+    near = ((points >= corners.min(0) - 1e-9) & (points <= corners.max(0) + 1e-9)).all(1)
+    # Of many points few are near: distances to all faces take far more room than the points.
+    near[near] = (points[near] @ hull.equations[:, :3].T + hull.equations[:, 3] <= 1e-9).all(1)
+    return np.asarray(near)

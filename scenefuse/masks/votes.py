@@ -1,32 +1,26 @@
 """What the masks of photos say of the sparse points, and so of each other."""
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import QhullError
 
+from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.photo_clicks import PhotoClicks
-from scenefuse.masks.box import in_hull
-from scenefuse.masks.prompts import Prompts, agreement, distance_to, pixel_of
+from scenefuse.masks.prompts import POINT_RADIUS_SHARE, Prompts, agreement, distance_to, pixel_of
+from scenefuse.masks.target import MIN_OBJECT_POINTS, in_hull, without_outermost
 from scenefuse.photos.workspace import Workspace
 
-# Quality of a mask, by its method's own estimate, from which it votes: SAM 2's was 0.44 to 0.77 for the bronze statue's
-# good masks, and is below 0.3 for most bad ones.
-MIN_QUALITY = 0.5
-# Agreement with its prompts from which a mask votes.
+# Points that a photo, or a click outside, is known by.
+MIN_KNOWN_POINTS = 4
+# Agreement of a mask with its prompts from which it votes, and of the votes on a point from which it is known.
 MIN_AGREEMENT = 0.8
-# Share of a point's votes for one side from which it is known to be on that side.
-MIN_VOTE_SHARE = 0.8
-# Percentage of the object's points at each side, along each axis, that may be mismatched.
-OUTERMOST_PERCENT = 1.0
-# So many of these points, on which so many photos vote, span the object: a single mask may hold what is around it.
-MIN_SPANNING_POINTS, SPANNING_PHOTOS = 8, 2
-# Half width of the band along a mask's outline in which no point votes, as a share of the photo's longer side.
-OUTLINE_BAND_SHARE = 0.003
+# Points on which so many photos vote span the object: a single mask may hold what is around it.
+SPANNING_PHOTOS = 2
 
 
 @dataclass
@@ -40,6 +34,7 @@ class Voter:
         rows: (N,) sparse points it votes on.
         inside: (N,) whether they are the object's.
         clicks: those in this photo that the mask agrees with.
+        denied: sparse points that each click outside says not to be the object's, the nearest to it first.
     """
 
     mask: Mask
@@ -48,19 +43,39 @@ class Voter:
     rows: NDArray[np.int64]
     inside: NDArray[np.bool_]
     clicks: PhotoClicks
+    denied: list[NDArray[np.int64]] = field(default_factory=list)
 
     @property
     def votes(self) -> bool:
         """Whether it counts."""
-        return self.quality >= MIN_QUALITY and self.agreement >= MIN_AGREEMENT
+        return self.quality > 0 and self.agreement >= MIN_AGREEMENT
+
+    @property
+    def final(self) -> bool:
+        """Whether it is what a person clicked, which no other photo overrules."""
+        return self.votes and self.clicks.enough
 
 
 def voter_of(photos: Workspace, k: int, mask: Mask, quality: float, agreement: float, clicks: PhotoClicks) -> Voter:
     """What a photo's mask says of the points that the photo sees, but for those next to its outline."""
     u, v = pixel_of(photos.seen_at[k], mask)
-    band = OUTLINE_BAND_SHARE * max(mask.shape)
+    band = POINT_RADIUS_SHARE * max(mask.shape)
     sure = (distance_to(mask) + distance_to(~mask))[v, u] > band if len(u) else np.zeros(0, dtype=bool)
-    return Voter(mask, quality, agreement, photos.seen[k][sure], mask[v, u][sure], clicks)
+    return Voter(
+        mask, quality, agreement, photos.seen[k][sure], mask[v, u][sure], clicks, _denied(photos, k, mask, clicks)
+    )
+
+
+def _denied(photos: Workspace, k: int, mask: Mask, clicks: PhotoClicks) -> list[NDArray[np.int64]]:
+    """Rows of the few points nearest to each click outside that are nearer to it than to the mask (H, W)."""
+    rows, at = photos.seen[k], photos.seen_at[k]
+    u, v = pixel_of(at, mask)
+    away, denied = distance_to(mask)[v, u], []
+    for click in clicks.off:
+        off = np.linalg.norm(at - click, axis=1)
+        near = np.argsort(off, kind="stable")[:MIN_KNOWN_POINTS]
+        denied.append(rows[near[off[near] < away[near]]])
+    return denied
 
 
 def vote_shares(photos: Workspace, made: dict[int, Voter]) -> Array:
@@ -74,45 +89,61 @@ def vote_shares(photos: Workspace, made: dict[int, Voter]) -> Array:
         return votes / total
 
 
-def without_outermost(points: Array) -> Array:
-    """Of (N, 3) points of the object those that are not the outermost along an axis, where there are many."""
-    if not len(points):
-        return points
-    low = np.percentile(points, OUTERMOST_PERCENT, axis=0, method="lower")
-    high = np.percentile(points, 100 - OUTERMOST_PERCENT, axis=0, method="higher")
-    return points[((points >= low) & (points <= high)).all(1)]
-
-
-def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
-    """(P,) 1 for sparse points known to be the object's, -1 for those known not to be, 0 for all others; and (P,) those
-    of the others that the object's enclose.
+def known_points(photos: Workspace, made: dict[int, Voter]) -> NDArray[np.int8]:
+    """(P,) 1 for sparse points known to be the object's, -1 for those known not to be, 0 for all others.
 
     A first mask that lacks a part (a wall in the shade) would have all others leave it out. So within the convex
     hull of the object's points no mask says that a point is not on it. Points by stereo are known to be the object's,
-    or unknown: they are dense, so a part is full of them, and so is what lies between the object's parts.
+    or unknown: they are dense, so a part is full of them, and so is what lies between the object's parts. A click
+    outside overrules all of this.
     """
     share = vote_shares(photos, made)
-    known = np.where(share >= MIN_VOTE_SHARE, 1, np.where(share <= 1 - MIN_VOTE_SHARE, -1, 0)).astype(np.int8)
+    known = np.where(share >= MIN_AGREEMENT, 1, np.where(share <= 1 - MIN_AGREEMENT, -1, 0)).astype(np.int8)
     rows = [voter.rows for voter in made.values() if voter.votes]
     counts = np.bincount(np.concatenate([np.zeros(0, np.int64), *rows]), minlength=len(known))
     own = without_outermost(photos.points[(known > 0) & (counts >= SPANNING_PHOTOS)])
-    enclosed, sparse = np.zeros(len(known), dtype=bool), np.arange(len(known)) < len(known) - photos.by_stereo
-    if len(own) >= MIN_SPANNING_POINTS:
+    if len(own) >= MIN_OBJECT_POINTS:
         with suppress(QhullError):  # of points in a plane, which enclose nothing
-            enclosed = (known <= 0) & in_hull(photos.points, own)
-    known[enclosed] = 0
-    known[~sparse & (known < 0)] = 0
-    return known, enclosed & sparse
+            known[(known < 0) & in_hull(photos.points, own)] = 0
+    by_stereo = np.arange(len(known)) >= len(known) - photos.by_stereo
+    known[by_stereo & (known < 0)] = 0
+    for voter in made.values():
+        for near in voter.denied if voter.votes else []:
+            known[near] = -1
+    return known
 
 
 def known_pixels(photos: Workspace, k: int, others: dict[int, Voter]) -> Prompts:
-    """What the votes of the others say of a photo's points."""
-    known, enclosing = known_points(photos, others)
-    kind, enclosed = known[photos.seen[k]], enclosing[photos.seen[k]]
-    at = photos.seen_at[k]
-    return Prompts(known=at[kind > 0], known_off=at[kind < 0], enclosed=at[enclosed])
+    """What the others say of a photo's points: by their votes, and by their clicks outside, each of which is a click in
+    this photo, too, at the nearest of its points that this photo sees."""
+    kind, at = known_points(photos, others)[photos.seen[k]], photos.seen_at[k]
+    place = dict(zip(photos.seen[k].tolist(), at))
+    denied = (near for voter in others.values() if voter.votes for near in voter.denied)
+    off = [next((place[row] for row in near.tolist() if row in place), None) for near in denied]
+    clicked_off = np.array([pixel for pixel in off if pixel is not None]).reshape(-1, 2)
+    return Prompts(clicked_off=clicked_off, known=at[kind > 0], known_off=at[kind < 0])
 
 
 def agrees_with_others(photos: Workspace, k: int, mask: Mask, others: dict[int, Voter]) -> bool:
     """Whether a mask (H, W) agrees with the votes of the others; so it does where these know nothing of its photo."""
     return agreement(mask, known_pixels(photos, k, others), 0) >= MIN_AGREEMENT
+
+
+def points_in_masks(photos: Workspace, masks: list[Mask]) -> Array:
+    """(N, 3) sparse points that lie in the photos' masks (H, W) wherever they are seen, without the outermost.
+
+    Raises:
+        StageError: there are fewer than ten of them.
+    """
+    seen, hit = np.zeros(len(photos.points)), np.zeros(len(photos.points))
+    for rows, pixels, mask in zip(photos.seen, photos.seen_at, masks):
+        u, v = np.clip(pixels.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
+        np.add.at(seen, rows, 1)
+        np.add.at(hit, rows, mask[v, u])
+    own = photos.points[(seen >= 2) & (hit > MIN_AGREEMENT * seen)]
+    if len(own) < MIN_OBJECT_POINTS:
+        raise StageError(
+            f"only {len(own)} sparse points lie in the supplied masks; "
+            "are they white on the object, and of these photos?"
+        )
+    return without_outermost(own)

@@ -74,7 +74,7 @@ class Segmenter:
 
         The weights are fetched, as the workflow would, where nothing has tried that yet.
         """
-        from scenefuse.masks.grabcut_passes import query_grabcut
+        from scenefuse.masks.grabcut import query_grabcut
 
         settings = self._settings
         with self._busy:
@@ -150,7 +150,7 @@ class Segmenter:
             StageError: the photo cannot be read.
         """
         from scenefuse.masks.propagation import one_photo
-        from scenefuse.masks.votes import MIN_AGREEMENT, MIN_QUALITY
+        from scenefuse.masks.votes import MIN_AGREEMENT
         from scenefuse.photos.workspace import View
 
         self.load()
@@ -166,7 +166,7 @@ class Segmenter:
                 # As the workflow has it, in the undistorted photo.
                 size = min(self._photo_px, max(picture.width, picture.height))
                 tolerance_px = self._settings["max_click_residual_px"] * max(height, width) / size
-                mask, quality, agreement, left_out = one_photo(self._ask, view, clicks, tolerance_px)
+                mask, _, agreement, left_out = one_photo(self._ask, view, clicks, tolerance_px)
         finally:
             self._waiting -= 1
         notes = []
@@ -175,9 +175,7 @@ class Segmenter:
         if left_out:
             clicks_lie = "click lies" if len(left_out) == 1 else "clicks lie"
             notes.append(f"{len(left_out)} {clicks_lie} on the wrong side of its outline and would be left out")
-        if quality < MIN_QUALITY:
-            notes.append(f"its quality is {quality:.2f}, at least {MIN_QUALITY} is needed: add clicks")
-        elif agreement < MIN_AGREEMENT:
+        if agreement < MIN_AGREEMENT:
             notes.append(f"it agrees with {agreement:.2f} of the clicks, at least {MIN_AGREEMENT} is needed")
         return mask, notes
 

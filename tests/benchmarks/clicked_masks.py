@@ -168,7 +168,7 @@ def _trial(
         found = prompted.masks_from_prompts(
             marked, thing.folder / "sparse", thing.sizes, thing.photos, thing.up, network, settings, 0
         )
-        scored = score_masks(found.masks, found.target, thing.photos.views, settings)
+        scored = score_masks(found.masks, found.target, thing.photos.views, settings, found.clicked)
     except StageError as error:
         return row | dict.fromkeys(("median", "mean", "least", "right", "kept", "left_out"), 0) | {"error": str(error)}
     iou = {

@@ -176,7 +176,7 @@ def new_words(source):
             "scenefuse/register/refinement.py",
             {"register.py", "paper/register_as_paper.py", "register/register_finely.py"},
         ),
-        ("scenefuse/masks/grabcut_passes.py", {"masks/make_masks.py", "pick.py"}),
+        ("scenefuse/masks/grabcut.py", {"masks/make_masks.py", "pick.py"}),
         ("scripts/masks/make_masks.py", {"masks/make_masks.py"}),
     ],
 )

@@ -20,9 +20,7 @@ from scenefuse.marks.clicks import read_points
 from scenefuse.marks.triangulation import marked_size
 from scenefuse.masks import make_masks as masks_module
 from scenefuse.masks.algebra import kept_part, mask_folders
-from scenefuse.masks.box import find_ground, upright_box
-from scenefuse.masks.grabcut import cleaned, second_trimap
-from scenefuse.masks.grabcut_passes import stamp
+from scenefuse.masks.grabcut import cleaned, second_trimap, stamp
 from scenefuse.masks.make_masks import MaskInputs, make_masks
 from scenefuse.masks.prompted import masks_from_prompts
 from scenefuse.masks.sam2 import Sam2Transformers, check_weights, segment
@@ -33,8 +31,8 @@ from scenefuse.masks.sam2_weights import (
     fetch_sam2_weights,
     why_unavailable,
 )
-from scenefuse.masks.segmentation import MaskSettings
-from scenefuse.masks.target import target_from_points
+from scenefuse.masks.segmentation import MaskSettings, score_masks
+from scenefuse.masks.target import find_ground, target_from_points, upright_box
 from scenefuse.photos.pictures import read_rgb
 from scenefuse.photos.workspace import View, Workspace, read_model, read_workspace
 
@@ -552,6 +550,38 @@ def test_hull_of_true_masks_is_the_ball():
     views[0] = view(0, np.zeros((HEIGHT, WIDTH), bool))
     assert len(carve(box, lambda x: x[:, 2], views, 60, 0.0).shell) == 0
     assert len(carve(box, lambda x: x[:, 2], views, 60, 0.2).shell) > 0.5 * len(hull.shell)
+
+
+def ring(angles, keep=lambda x, k: x):
+    """Cameras five away from the ball, at these angles and the ball's height, with its masks, changed by `keep`."""
+    views = []
+    for k, angle in enumerate(np.radians(angles)):
+        forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
+        right = np.cross(forward, [0, 0, 1])
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        pose = np.vstack([np.column_stack([rotation, -rotation @ (CENTRE - 5 * forward)]), [0, 0, 0, 1]])
+        views.append(dataclasses.replace(view(k, keep(look(pose)[0], k)), name=f"{k}", cam_from_world=pose))
+    return views
+
+
+@pytest.mark.parametrize("case", ["two from the side", "some lack a half", "some leak"])
+def test_a_hull_is_of_the_most_masks_that_agree_so_that_a_few_others_reject_no_right_one(case):
+    leak = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    leak[15:75, 10:110] = True
+    angles, wrong, spoil = {
+        # Masks of one side leave the hull long; two from the side are right, and bound it.
+        "two from the side": ([*range(-20, 21, 5), 85, 95], [], None),
+        "some lack a half": (range(0, 360, 36), [1, 4, 7], lambda ball: ball & (np.arange(HEIGHT) > 50)[:, None]),
+        "some leak": (range(0, 360, 36), [1, 4, 7, 8], lambda ball: ball | leak),
+    }[case]
+    views = ring(angles, lambda ball, k: spoil(ball) if k in wrong else ball)
+    corners = CENTRE + 2 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    nothing = [np.zeros(0, np.int64)] * len(views)
+    photos = Workspace(Path(), views, np.zeros((0, 3)), nothing, [np.zeros((0, 2))] * len(views))
+    target = target_from_points(corners, photos, np.array([0, 0, 1.0]), 0)
+    settings = dataclasses.replace(SETTINGS, hull_voxels=60)
+    scored = score_masks([v.pixels for v in views], target, views, settings)
+    assert sorted(map(int, scored.dropped)) == wrong
 
 
 def test_ground_of_a_tilted_bowl_is_measured_beside_the_object():

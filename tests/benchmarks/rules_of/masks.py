@@ -124,7 +124,7 @@ def evaluate(number: int, rule: Rule | None) -> dict[str, Any]:
         found = masks_from_prompts(
             capture.marked, capture.folder / "sparse", capture.sizes, capture.photos, capture.up, network, settings, 0
         )
-        scored = score_masks(found.masks, found.target, capture.photos.views, settings)
+        scored = score_masks(found.masks, found.target, capture.photos.views, settings, found.clicked)
     except StageError as error:
         return row | {"reason": str(error)}
     kept = {name: mask for name, mask in scored.masks.items() if name not in scored.dropped}
@@ -143,24 +143,24 @@ def _mask_as_it_is(position: int) -> Any:
 
 M = "scenefuse.masks"
 RULES = [
-    Rule("no votes next to the outline", f"{M}.votes.OUTLINE_BAND_SHARE", lambda _: 0.0),
-    Rule("enclosed points are unknown", f"{M}.votes.MIN_SPANNING_POINTS", _never),
-    Rule("a mask needs a quality to vote", f"{M}.votes.MIN_QUALITY", lambda _: 0.0),
+    Rule("no votes next to the outline", f"{M}.votes.POINT_RADIUS_SHARE", lambda _: 0.0),
+    Rule("enclosed points are unknown", f"{M}.votes.MIN_OBJECT_POINTS", _never),
+    Rule("a click outside counts in all photos", f"{M}.votes._denied", lambda _: lambda *__: []),
     Rule("points by stereo", f"{M}.prompted.with_stereo_points", lambda _: lambda photos: photos),
     Rule("four prompts in the middle", f"{M}.sam2.MIDDLE_POINTS", lambda _: 1),
     Rule("prompts outside near only", f"{M}.sam2.MAX_OUTSIDE_DISTANCE_SHARE", _never),
     Rule("the largest of several clicks' masks", f"{M}.propagation.SCORE_MARGIN", lambda _: 1e-9),
-    Rule("parts prompt alone", f"{M}.propagation.with_parts", _mask_as_it_is(2)),
-    Rule("parts have to look alike or reach", f"{M}.parts._looks_alike", lambda _: lambda *__: True),
+    Rule("corrections by known points", f"{M}.propagation.CORRECTIONS", lambda _: 0),
+    Rule("clicked parts prompt alone", f"{M}.propagation._with_clicked_parts", _mask_as_it_is(2)),
     Rule("parts of a mask that nothing prompts", f"{M}.propagation.prompted_parts", _mask_as_it_is(0)),
     Rule("contradicted masks once more", f"{M}.propagation.agrees_with_others", lambda _: lambda *__: True),
     Rule("parts of a last mask", f"{M}.prompted._own_parts", _mask_as_it_is(0)),
     Rule("SAM 2 again by the hull", f"{M}.segmentation.MIN_SHARE_OF_MEDIAN", lambda _: 0.0),
     Rule("outlines move to edges", f"{M}.segmentation.along_edges", _mask_as_it_is(1)),
     Rule("gaps by their colours", f"{M}.grabcut.PINHOLE_SHARE", _never),
-    Rule("masks trusted by a tolerant hull", f"{M}.segmentation.MAX_WRONG_UNTRUSTED_SHARE", lambda _: 0.0),
-    Rule("seeds grow along even colours", f"{M}.grabcut_passes.grow_seeds", lambda _: lambda *__: None),
+    Rule("masks compared by a tolerant hull, too", f"{M}.segmentation.MAX_LACKING_SHARE", lambda _: 0.1),
+    Rule("seeds grow along even colours", f"{M}.grabcut.grow_seeds", lambda _: lambda *__: None),
     Rule("close prompts enclose a part", f"{M}.target.MAX_PART_EDGE_SHARE", lambda _: 0.0),
-    Rule("clicked specks stay", f"{M}.grabcut_passes.prompted_parts", lambda _: lambda mask, *__: mask & False),
+    Rule("clicked specks stay", f"{M}.grabcut.prompted_parts", lambda _: lambda mask, *__: mask & False),
     Rule("clicks on a point may miss by 3 %", f"{M}.prompted.MAX_MISS_SHARE", lambda _: 0.0),
 ]

@@ -1,4 +1,4 @@
-"""Parts of the object in masks: found by points of coarse stereo, or prompted alone."""
+"""Parts of the object in masks that points of coarse stereo find."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,14 +9,10 @@ from support.photographed_plane import BLANK, photographs
 
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.marks.photo_clicks import PhotoClicks
-from scenefuse.masks.parts import with_parts
-from scenefuse.masks.prompts import Prompts
-from scenefuse.masks.propagation import propagate
+from scenefuse.masks.propagation import NO_CLICKS, propagate
 from scenefuse.masks.stereo_points import with_stereo_points
 from scenefuse.masks.votes import known_points, voter_of
-from scenefuse.photos.workspace import View, Workspace
-
-NO_CLICKS = PhotoClicks(np.zeros((0, 2)), np.zeros(0, dtype=bool))
+from scenefuse.photos.workspace import Workspace
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +73,7 @@ def test_photos_that_stereo_cannot_match_are_left_as_they_are(plane, capsys):
 def test_points_by_stereo_say_what_is_the_object_and_never_what_is_not(plane, more):
     sparse = len(plane.points)
     lacking = voter_of(more, 0, disc(more.views[0], 0.5), 0.9, 1.0, NO_CLICKS)
-    kind, _ = known_points(more, {0: lacking})
+    kind = known_points(more, {0: lacking})
     assert (kind[:sparse] == -1).any() and (kind[sparse:] == 1).any() and not (kind[sparse:] == -1).any()
 
 
@@ -98,38 +94,3 @@ def test_a_part_without_features_is_found_by_stereo_though_the_network_is_surer_
     assert mask_iou(found.masks[1], disc(few.views[1])) < 0.8
     found = propagate(segment, with_stereo_points(few), told, 2)
     assert all(mask_iou(m, disc(v)) > 0.99 for m, v in zip(found.masks, few.views))
-
-
-@pytest.mark.parametrize(("like", "added"), [("mask", True), ("surroundings", False)])
-def test_a_part_that_looks_like_what_is_around_it_is_added_only_if_it_was_clicked(like, added):
-    rng = np.random.default_rng(0)
-    mask, part = np.zeros((120, 160), dtype=bool), np.zeros((120, 160), dtype=bool)
-    mask[40:80, 30:80] = True
-    part[50:70, 80:100] = True
-    colors = {"mask": (150, 80, 60), "surroundings": (120, 160, 220)}
-    image = np.where((mask | (part if like == "mask" else False))[..., None], colors["mask"], colors["surroundings"])
-    image = (image + rng.integers(-20, 20, image.shape)).astype(np.uint8)
-    view = View("a.jpg", np.eye(3), np.eye(4), 160, 120, image)
-
-    def segment(*_):
-        return [part], np.array([0.9])
-
-    on = np.column_stack([rng.uniform(82, 98, 6), rng.uniform(52, 68, 6)])
-    of_mask = np.column_stack([rng.uniform(32, 78, 20), rng.uniform(42, 78, 20)])
-    known = with_parts(segment, view, mask, Prompts(known=np.concatenate([of_mask, on])), 2.0)
-    assert (known == (mask | part if added else mask)).all()
-    clicked = with_parts(segment, view, mask, Prompts(on, known=of_mask), 2.0)
-    assert (clicked == mask | part).all()
-
-
-def test_a_part_that_goes_far_beyond_the_points_next_to_an_outline_is_not_added():
-    mask, part = np.zeros((120, 160), dtype=bool), np.zeros((120, 160), dtype=bool)
-    mask[40:80, 30:80] = True
-    part[45:75, 80:130] = True
-    view = View("a.jpg", np.eye(3), np.eye(4), 160, 120, np.full((120, 160, 3), 100, np.uint8))
-    rng = np.random.default_rng(0)
-    for farthest, added in ((90, False), (125, True)):
-        on = np.column_stack([np.linspace(82, farthest, 12), rng.uniform(56, 64, 12)])
-        known = np.concatenate([np.column_stack([rng.uniform(32, 78, 20), rng.uniform(42, 78, 20)]), on])
-        found = with_parts(lambda *_: ([part], np.array([0.9])), view, mask, Prompts(known=known), 2.0)
-        assert (found == (mask | part if added else mask)).all()
