@@ -61,7 +61,7 @@ class Crops:
         move = cv2.invertAffineTransform(self.crop_from_photo[index])
         move[:, 2] += 0.5 * move[:, :2].sum(1) - 0.5  # OpenCV has pixel centres at integers
         photo = cv2.warpAffine(on_canvas, move, (width, height), borderMode=cv2.BORDER_REPLICATE)
-        return photo * self.masks[index, :height, :width]
+        return np.where(self.masks[index, :height, :width], photo, np.float32(0))
 
 
 def crop_to_object(views: Views, crop_px: int) -> Crops:
@@ -77,24 +77,21 @@ def crop_to_object(views: Views, crop_px: int) -> Crops:
     ideal = np.array([crop_px * aspect**0.5, crop_px / aspect**0.5])
     largest = np.minimum(np.minimum(ideal, extent.max(0)), [width, height])
     canvas = np.maximum(np.ceil(largest / 4) * 4, MIN_CANVAS_PX).astype(int)
-    images, mattes, intrinsics, moves = [], [], [], []
+    pictures: tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8]]] = ([], [])
+    intrinsics, moves = [], []
     for index, box in enumerate(boxes):
         shrink = min(1.0, *(canvas / extent[index]))
         size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
         scale = np.array(size) / [width, height]
         corner = np.round((box[:2] + box[2:]) / 2 * scale - canvas / 2).astype(int)
         move = np.column_stack([np.diag(scale), -corner])
-        for parts, whole in ((images, views.images), (mattes, views.mattes)):
+        for parts, whole in zip(pictures, (views.images, views.mattes)):
             parts.append(_window(cv2.resize(whole[index], size, interpolation=cv2.INTER_AREA), corner, canvas))
         intrinsics.append(np.vstack([move, [0, 0, 1]]) @ views.intrinsics[index])
         moves.append(move)
-    cut = replace(
-        views,
-        images=np.stack(images),
-        mattes=np.stack(mattes),
-        beyond=np.zeros((len(mattes), *mattes[0].shape), bool),
-        intrinsics=np.stack(intrinsics),
-    )
+    images, mattes = (np.stack(parts) for parts in pictures)
+    nothing = np.zeros(mattes.shape, np.bool_)
+    cut = replace(views, images=images, mattes=mattes, beyond=nothing, intrinsics=np.stack(intrinsics))
     return Crops(cut, np.stack(moves), views.masks, views.sizes)
 
 

@@ -161,14 +161,13 @@ def align_to_points(predicted: Array, measured: Array) -> tuple[float, float]:
     if len(predicted) < MIN_POINTS:
         return 1.0, 0.0
 
-    def cost(scale: float, shift: float, free: int) -> float:
-        residual = np.median(np.abs(scale * predicted + shift - measured))
-        return float(residual) * (1.0 + free / np.sqrt(len(predicted)))
-
-    scale = float(np.median(measured / predicted))
     line = siegelslopes(measured, predicted)
-    options = (1.0, 0.0), (scale, 0.0), (float(line.slope), float(line.intercept))
-    return min(options, key=lambda option: cost(*option, options.index(option)))
+    options = [(1.0, 0.0), (float(np.median(measured / predicted)), 0.0), (float(line.slope), float(line.intercept))]
+    costs = [
+        float(np.median(np.abs(scale * predicted + shift - measured))) * (1 + free / np.sqrt(len(predicted)))
+        for free, (scale, shift) in enumerate(options)
+    ]
+    return options[int(np.nanargmin(costs))]
 
 
 def residuals_at_points(depth: Tensor, points: list[NDArray[np.float32]]) -> list[Array]:
