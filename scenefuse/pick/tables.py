@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from scenefuse.core.project import Project
 from scenefuse.core.stage import StageError, read_json
+from scenefuse.crop.one_photo import MIN_INSIDE
 from scenefuse.marks.clicks import Kind
 from scenefuse.photos.photo_files import frame_name, thin_out, upright_size
 from scenefuse.photos.photos import photo_names, without_copies
@@ -39,8 +40,6 @@ ADVICE: dict[tuple[str, Kind], str] = {
     " photos.",
     ("lengths", "lengths"): f"Needed only for metres where there are neither GPS nor control points. {LENGTH}",
 }
-# Clicks inside that the workflow needs.
-MIN_INSIDE = {"prompts": 1, "fiducials": 3}
 
 
 class Table:
@@ -99,7 +98,8 @@ class Table:
 
     def problems(self) -> list[str]:
         """What the workflow would refuse or leave out, a sentence each."""
-        return problems(self.document.rows, self.document.kind, self.sizes, MIN_INSIDE.get(self.column, 1))
+        fewest = MIN_INSIDE if self.column == "fiducials" else 1
+        return problems(self.document.rows, self.document.kind, self.sizes, fewest)
 
     def read_cameras(self) -> None:
         """Read the cameras that the workflow has found by now."""
