@@ -130,7 +130,7 @@ def test_frames_of_a_video_are_clicked_in_the_video_s_pixels(yard):
     ("change", "expected"),
     [
         (lambda p: None, "unknown object 'barn'; objects.tsv lists: shed"),
-        (lambda p: (p.path / "close/2.jpg").write_bytes(b"x"), r"close/2\.jpg cannot be read"),
+        (lambda p: (p.path / "close/2.jpg").write_bytes(b"x"), r"close/2\.jpg cannot be decoded"),
     ],
 )
 def test_what_is_wrong_is_said_before_the_page_opens(yard, change, expected):
