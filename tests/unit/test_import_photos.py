@@ -410,8 +410,9 @@ def test_a_sphere_from_the_files_to_its_cloud_and_a_nerf_without_a_cloud(tmp_pat
         ["masks", "nerf", "object.ply", "renders.png", "report.json", "steps", "undistorted"]
     )
     assert (out / "renders.png").stat().st_size > 5000
-    # The same NeRF again, of which nothing is sure enough.
+    # The same NeRF again, on no point of which all photos agree.
     monkeypatch.setattr("scenefuse.nerf.train_nerf.train_object_nerf", lambda **_: None)
+    quick.write_text(yaml.safe_dump({"object": QUICK | {"cloud": QUICK["cloud"] | {"min_views": 24}}}))
     strict = replace(OPTIONS, gates=replace(OPTIONS.gates, min_confidence=1.0))
     assert train_nerf(**trained, options=strict) == 3
     assert "no surface found" in value(read_json(out / "report.json"), "no_cloud_because")

@@ -238,7 +238,7 @@ def test_clicks_in_photos_that_will_not_be_there_are_named_before_anything_runs(
     ):
         check_marks(path, photos)
     photos["3.jpg"].write_bytes(b"cut")
-    with pytest.raises(StageError, match=r"3\.jpg cannot be read as a picture"):
+    with pytest.raises(StageError, match=r"3\.jpg cannot be decoded"):
         check_marks(path, photos)
     path.write_text("point\tx\ty\tz\na\t1\t2\t3\n")
     check_marks(path, photos)
