@@ -265,7 +265,7 @@ def test_a_model_that_is_upright_already_says_so_in_its_workspace(capture, tmp_p
 def test_a_photo_that_was_replaced_is_named_by_those_who_read_it(tmp_path):
     (tmp_path / "photos").mkdir()
     for index in range(3):
-        Image.new("RGB", (40, 30), (index, 0, 0)).save(tmp_path / "photos" / f"{index}.png")
+        Image.new("RGB", (40, 30), (100 + index, 0, 0)).save(tmp_path / "photos" / f"{index}.png")
     list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
     Image.new("RGB", (40, 30), (200, 0, 0)).save(tmp_path / "photos" / "1.png")
     reading = {"folder": tmp_path / "upright", "photos": tmp_path / "photos.json"}
@@ -338,7 +338,7 @@ def test_photos_that_show_different_things_or_nothing(tmp_path, seen, advice):
     (tmp_path / "photos").mkdir()
     for index in range(3):
         noise = gaussian_filter(rng.uniform(0, 255, (120, 160)), 1.5)
-        noise = (noise - noise.min()) / np.ptp(noise) * 55 * seen + 100 + index
+        noise = (noise - noise.min()) / np.ptp(noise) * 140 * seen + 110 + index
         Image.fromarray(noise.astype(np.uint8)).save(tmp_path / "photos" / f"{index}.png")
     list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
     extract_features(
