@@ -15,9 +15,8 @@ from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.masks.target import Target
 from scenefuse.photos.workspace import View, Workspace
 
-# Share of the photos that may contradict a voxel of the hull, as some masks are wrong somewhere: of the last masks, of
-# first masks, which are made photo by photo, and for another hull by which masks are compared: where many lack the same
-# part, they would carve it away.
+# Share of the photos that may contradict a voxel of the hull, as some masks are wrong somewhere; the same for GrabCut's
+# first masks, and for another hull by which masks are compared: where many lack a part, they would carve it away.
 MAX_WRONG_SHARE, MAX_WRONG_FIRST_SHARE, MAX_LACKING_SHARE = 0.1, 0.2, 0.34
 # Share of the median mask's agreement with the hull below which SAM 2 makes a mask once more.
 MIN_SHARE_OF_MEDIAN = 0.9
@@ -104,7 +103,7 @@ def segment_again(
     """SAM 2 once more, with the visual hull's box and the photo's own clicks, where one of the masks (H, W) disagrees
     with the hull, or much more than most, unless clicks alone suffice for it; then all at the photo's resolution."""
     masks = list(masks)
-    hull = carve_consistent(target, photos.views, masks, settings, MAX_WRONG_FIRST_SHARE)
+    hull = carve_consistent(target, photos.views, masks, settings, MAX_WRONG_SHARE)
     outlines = [silhouette(hull, view) for view in photos.views]
     agreement = [mask_iou(mask, outline) for mask, outline in zip(masks, outlines)]
     least = max(settings.min_agreement, MIN_SHARE_OF_MEDIAN * float(np.median(agreement)))
