@@ -16,6 +16,8 @@ PACKAGE = Path(__file__).resolve().parent.parent
 SHIPPED = PACKAGE / "shipped"
 # Folder with workflow/, scripts/ and config/: inside the package where it was installed, else the clone's.
 ROOT = SHIPPED if SHIPPED.is_dir() else PACKAGE.parent
+# More values than any settings file has; messages about fewer are still short.
+MAX_VALUES = 10_000
 T = TypeVar("T")
 
 
@@ -36,6 +38,8 @@ def schema_of(name: str) -> dict[str, Any]:
 
 def problem(content: Any, schema: Mapping[str, Any]) -> str | None:
     """The first thing in `content` that a JSON schema does not allow, as one sentence that begins with its key."""
+    if _grows(content):
+        return "aliases of YAML expand without end; write what they stand for"
     for error in jsonschema.Draft202012Validator(schema).iter_errors(content):
         key = ".".join(str(part) for part in error.absolute_path)
         message = error.message
@@ -83,6 +87,16 @@ def read_differences(mine: Path) -> dict[str, Any]:
     if wrong:
         raise StageError(f"{mine}, {wrong}")
     return own
+
+
+def _grows(content: Any) -> bool:
+    """Whether content of YAML, whose aliases may repeat each other, has more than `MAX_VALUES` values."""
+    left, count = [content], 0
+    while left and count <= MAX_VALUES:
+        part = left.pop()
+        count += 1
+        left += part.values() if isinstance(part, dict) else part if isinstance(part, list) else ()
+    return bool(left)
 
 
 def build(settings: type[T], values: Mapping[str, Any]) -> T:
