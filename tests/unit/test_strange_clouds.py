@@ -467,11 +467,13 @@ def test_a_site_s_own_system_is_taken_as_such(tmp_path, name):
         to_wgs84(pyproj.CRS.from_wkt(value(place, "crs")), np.zeros((1, 3)), "photos")
 
 
-@pytest.mark.parametrize(("at", "kind", "number"), [(100, "<I", 2**32 - 1), (107, "<I", 2**32 - 1), (105, "<H", 3)])
+@pytest.mark.parametrize(
+    ("at", "kind", "number"), [(100, "<I", 2**32 - 1), (247, "<Q", 2**40), (105, "<H", 3), (243, "<I", 1)]
+)
 def test_a_las_header_that_counts_more_than_there_is_is_refused_at_once(tmp_path, at, kind, number):
-    survey(tmp_path / "a.las", {3072: 26918})
+    survey(tmp_path / "a.las", wkt=pyproj.CRS("EPSG:26918").to_wkt())
     content = bytearray((tmp_path / "a.las").read_bytes())
     struct.pack_into(kind, content, at, number)
     (tmp_path / "a.las").write_bytes(content)
-    with pytest.raises(StageError, match="counts more records than it holds|points are missing"):
+    with pytest.raises(StageError, match="counts more records than it holds|(points|records) are missing"):
         list(columns_in_parts(tmp_path / "a.las")())

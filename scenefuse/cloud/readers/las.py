@@ -96,14 +96,17 @@ def _check_header(path: Path) -> None:
     with open(path, "rb") as file:
         head = file.read(375)
         there = file.seek(0, 2)
-    if len(head) < 227 or not head.startswith(b"LASF"):
-        raise ValueError("it does not begin as LAS does")
-    begin, records, kind, length, count = struct.unpack_from("<IIBHI", head, 96)
-    if head[25] >= 4 and len(head) == 375:
-        start, more, long_count = struct.unpack_from("<QIQ", head, 235)
-        count = long_count or count
-        if more and there - start < 60 * more:
-            raise StageError(f"{path} is cut short: its last records are missing; copy it again")
+        if len(head) < 227 or not head.startswith(b"LASF"):
+            raise ValueError("it does not begin as LAS does")
+        begin, records, kind, length, count = struct.unpack_from("<IIBHI", head, 96)
+        if head[25] >= 4 and len(head) == 375:
+            start, more, long_count = struct.unpack_from("<QIQ", head, 235)
+            count = long_count or count
+            for _ in range(more):  # extended records behind the points, each with its length
+                file.seek(min(start + 20, there))
+                start += 60 + int.from_bytes(file.read(8), "little")
+                if start > there or start < begin:
+                    raise StageError(f"{path} is cut short: its last records are missing; copy it again")
     if 54 * records > begin or length < 20:
         raise ValueError("its header counts more records than it holds")
     missing = count - max(there - begin, 0) // length

@@ -195,8 +195,8 @@ def read_obj(path: Path) -> Columns:
     names = sorted(set(content.used))
     material = np.array([names.index(name) for name in content.used])[of]
     materials = tuple(known.get(name, Material()) for name in names) if known else ()
-    colors = None if colors is None else colors.astype(np.float64)
-    return sampled_columns(Mesh(table[:, :3], faces, colors, uvs, material, materials))
+    painted = None if colors is None else colors.astype(np.float64)
+    return sampled_columns(Mesh(table[:, :3], faces, painted, uvs, material, materials))
 
 
 def _row(cell: str, count: int) -> int:

@@ -77,7 +77,7 @@ def text_layout(path: Path) -> TextLayout:
     begin = TextLayout(above, mark, width, named)
     rows = begin.rows(path, list(islice(_lines(path), above, MAX_LAYOUT_ROWS)), above + 1, range(width))
     rows = rows[np.isfinite(rows).any(1)]
-    known = np.isfinite(rows).any(0)
+    known = np.asarray(np.isfinite(rows).any(0))
     names = _names(head[:above], mark, width)
     if len(names) == width:
         usual, said = common_names(names), list[str]()
