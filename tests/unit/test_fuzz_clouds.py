@@ -3,6 +3,7 @@
 A few dozen each here; a thousand each by `make fuzz`.
 """
 
+import copy
 import resource
 import struct
 import time
@@ -203,7 +204,7 @@ def test_any_glb_is_read_or_refused(folder, changes):
             node = document
             for key in path:
                 node = node[key]
-            node[last] = value
+            node[last] = copy.deepcopy(value)
 
     write_square(folder / "made.glb", change)
     read(folder, "a.glb", (folder / "made.glb").read_bytes())
