@@ -147,4 +147,4 @@ def test_the_paper_s_tables_are_made_without_an_object_that_failed(project, tmp_
     assert notes["barn"].str.contains("paper preset (here): failed, ", regex=False).all()
     assert notes["barn"].str.contains("2.jpg").all() and not notes["shed"].str.contains("failed").any()
     page = (summary / "report.html").read_text()
-    assert "Table 4: " in page and "<p>barn: paper preset (here): failed, " in page
+    assert "Table 4: " in page and "<p>barn, full: paper preset (here): failed, " in page
