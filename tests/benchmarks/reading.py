@@ -6,6 +6,7 @@ PYTHONPATH=tests python tests/benchmarks/reading.py
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,14 +28,12 @@ def reading(*, rows: int = 1_000_000, runs: int = 3) -> None:
         files = _files(Path(folder), rows)
         print(f"{'file':14}{'ours':>8}{'pandas':>16}{'Open3D':>16}{'NumPy':>16}   (seconds, ours over it)")
         for name, (path, above) in files.items():
-            own = path.suffix[1:]
+            mark = "," if path.suffix == ".csv" else None
             peers: dict[str, Callable[[], object]] = {
-                "ours": lambda path=path: read_cloud(path),
-                "pandas": lambda path=path, above=above: _pandas(path, above),
-                "Open3D": lambda path=path, own=own: o3d.io.read_point_cloud(str(path), format=own),
-                "NumPy": lambda path=path, above=above: np.loadtxt(
-                    path, skiprows=above, delimiter="," if path.suffix == ".csv" else None
-                ),
+                "ours": partial(read_cloud, path),
+                "pandas": partial(pd.read_csv, path, sep=mark or r"\s+", skiprows=above, header=None, dtype=np.float64),
+                "Open3D": partial(o3d.io.read_point_cloud, path),
+                "NumPy": partial(np.loadtxt, path, skiprows=above, delimiter=mark),
             }
             if path.suffix == ".csv":
                 del peers["Open3D"]  # which reads no commas
@@ -50,10 +49,6 @@ def reading(*, rows: int = 1_000_000, runs: int = 3) -> None:
                 for peer in ("pandas", "Open3D", "NumPy")
             ]
             print(f"{name:14}{least['ours']:8.2f}" + "".join(f"{cell:>16}" for cell in cells))
-
-
-def _pandas(path: Path, above: int) -> pd.DataFrame:
-    return pd.read_csv(path, sep="," if path.suffix == ".csv" else r"\s+", skiprows=above, header=None, dtype=float)
 
 
 def _files(folder: Path, rows: int) -> dict[str, tuple[Path, int]]:

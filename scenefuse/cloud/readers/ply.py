@@ -120,7 +120,7 @@ def _mesh_of_bytes(path: Path) -> tuple[Columns, list[Any]]:
     vertex = content["vertex"].data
     columns = {name: np.array(vertex[name]) for name in vertex.dtype.names if vertex.dtype[name].kind in "iuf"}
     face = content["face"].data if "face" in content else np.empty(0, [("", "u1")])
-    name = next((name for name in CORNERS if name in face.dtype.names), None)
+    name = next((name for name in CORNERS if name in (face.dtype.names or ())), None)
     return columns, [] if name is None else list(face[name])
 
 
