@@ -74,7 +74,8 @@ def test_a_note_says_that_the_object_s_own_crs_is_not_used(tmp_path, house, caps
     assert note in capsys.readouterr().out
 
 
-def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path):
+def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path, monkeypatch):
+    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
     trial = plant("house", 5, noise=0.005, object_points=6000, density_ratio=1.0)
     write_cloud(tmp_path / "scene.ply", Cloud(trial.scene.points + UTM, None, trial.scene.colors))
     rows = np.hstack([trial.object.points, trial.object.colors])
