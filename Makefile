@@ -1,9 +1,9 @@
-# make demo | check | test | lint | report | bench | docs | clean      (CORES=2 by default, PYTHON=python3)
+# make demo | check | test | test-faults | lint | report | bench | docs | clean      (CORES=2 by default, PYTHON=python3)
 CORES ?= 2
 PYTHON ?= python3
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: demo check test lint report bench bench-registration bench-nerf bench-scale fuzz mutants audit docs clean
+.PHONY: demo check test test-faults lint report bench bench-registration bench-nerf bench-scale fuzz mutants audit docs clean
 
 demo: .venv/ready
 	snakemake --configfile config/demo.yaml --cores $(CORES)
@@ -16,6 +16,12 @@ check: .venv/tests
 test: .venv/tests
 	envs/browser.sh
 	pytest -n $(CORES) --dist loadfile --no-loadscope-reorder --durations 20
+
+# Faults of every stage, and what follows (docs/results/faults.tsv); the tiny workflow runs first. About an hour on two cores.
+test-faults: .venv/tests
+	snakemake --configfile tests/data/tiny.yaml --directory results/faults --cores $(CORES)
+	PYTHONPATH=.:tests python tests/benchmarks/faults.py workflow --table docs/results/faults.tsv
+	PYTHONPATH=.:tests python tests/benchmarks/faults.py stages --finished results/faults --table docs/results/faults.tsv
 
 lint: .venv/ready
 	ruff check .

@@ -103,10 +103,15 @@ def _run() -> None:
         raise ModuleNotFoundError(name="snakemake")
     # Options of Snakemake that say where the project is, or that none is needed.
     _need_project("--config", "--directory", "-d", "-h", "--help", "--version")
-    for path in _configfiles():
+    own = ["--configfile", str(OWN_SETTINGS)] if _takes_own_settings() else []
+    for path in [*_configfiles(), *own[1:]]:
         if not Path(path).is_file():
             sys.exit(f"error: the settings file {path} cannot be read; correct its path")
-    words = [*(["--configfile", str(OWN_SETTINGS)] if _takes_own_settings() else []), *sys.argv[1:]]
+        if b"__use_yte__" in Path(path).read_bytes():
+            sys.exit(
+                f"error: {path} asks Snakemake to run Python that stands in it; remove __use_yte__ (docs/trust.md)"
+            )
+    words = [*own, *sys.argv[1:]]
     # As `python -m snakemake`, but its help and errors name the command that was typed.
     start = "import sys; sys.argv[0] = 'scenefuse run'; from snakemake.cli import main; main()"
     command = [sys.executable, "-c", start, "--snakefile", str(ROOT / "Snakefile"), *words]

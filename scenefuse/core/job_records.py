@@ -4,6 +4,15 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from scenefuse.core.stage import OUT_OF_MEMORY
+
+ERROR = re.compile(r"\s*(error:|[\w.]*(Error|Exception)\b)")
+# What Python and the libraries say when memory cannot be had, also while they are loaded.
+LACK_OF_MEMORY = re.compile(
+    "^MemoryError|bad_alloc|[Cc]annot allocate memory|can't allocate memory|failed to map segment|ould not load.*llvm"
+)
+KILLED = "its job ended without a message: perhaps killed (out of memory?); see the log"
+
 
 @dataclass(frozen=True)
 class JobRecords:
@@ -13,10 +22,12 @@ class JobRecords:
     """Folder of the rules' logs, {rule}/{job}.log."""
     benchmarks: Path
     """Folder of the benchmark files, {rule}/{job}.tsv; a job that ends well leaves one newer than its log."""
+    failed_logs: tuple[Path, ...] = ()
+    """Logs of the jobs that failed in this run, where they are known; other logs may be of earlier runs."""
 
 
 def why_unfinished(jobs: JobRecords, *names: str) -> str:
-    """Why jobs stopped: the last error line of the newest unfinished log that holds one.
+    """Why jobs stopped: the last error line of a job that failed, or of the newest unfinished log that holds one.
 
     A job that was killed, out of memory for instance, leaves a log without an error. "" when every job that left a
     log has finished.
@@ -26,23 +37,28 @@ def why_unfinished(jobs: JobRecords, *names: str) -> str:
         names: of logs, {name}.log, in the order in which they are searched; after them, all whose name holds the first.
     """
     named = re.compile(rf"(^|[^A-Za-z0-9_]){re.escape(names[0])}($|[^A-Za-z0-9_])")
-    logs = [p for p in jobs.logs.rglob("*.log") if not _finished(p, jobs)]
-    logs.sort(key=lambda p: (p.stat().st_mtime, p.as_posix()), reverse=True)
-    exact = ([p for p in logs if p.stem == name] for name in names)
-    for found in (*exact, [p for p in logs if named.search(p.relative_to(jobs.logs).as_posix())]):
-        if found:
-            return next(filter(None, (_error(p, jobs) for p in found)), "") or (
-                "its job ended without a message: perhaps killed (out of memory?);"
-                f" see the log [{found[0].relative_to(jobs.logs).as_posix()}]"
-            )
+    unfinished = [p for p in jobs.logs.rglob("*.log") if not _finished(p, jobs)]
+    unfinished.sort(key=lambda p: (p.stat().st_mtime, p.as_posix()), reverse=True)
+    for logs in ([p for p in jobs.failed_logs if p.is_file()], unfinished):
+        exact = ([p for p in logs if p.stem == name] for name in names)
+        for found in (*exact, [p for p in logs if named.search(p.relative_to(jobs.logs).as_posix())]):
+            if found:
+                log = next(filter(last_error, found), found[0])
+                return f"{last_error(log) or KILLED} [{log.relative_to(jobs.logs).as_posix()}]"
     return ""
 
 
-def _error(log: Path, jobs: JobRecords) -> str:
-    """The last error line of a log, and the log; "" without one."""
-    lines = log.read_text(errors="replace").splitlines()
-    errors = [line.strip() for line in lines if re.match(r"\s*(error:|[\w.]*(Error|Exception)\b)", line)]
-    return f"{errors[-1].removeprefix('error: ')} [{log.relative_to(jobs.logs).as_posix()}]" if errors else ""
+def last_error(log: Path) -> str:
+    """The last error line of a log; "" without one."""
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
+    # A library that cannot have memory may end the process.
+    errors = [line for line in lines if ERROR.match(line)] or [line for line in lines if LACK_OF_MEMORY.search(line)]
+    if not errors:
+        return ""
+    last = errors[-1]
+    if last.startswith("error: "):
+        return last.removeprefix("error: ")
+    return f"{OUT_OF_MEMORY} ({last})" if LACK_OF_MEMORY.search(last) else last
 
 
 def _finished(log: Path, jobs: JobRecords) -> bool:

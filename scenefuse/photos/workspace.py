@@ -190,10 +190,21 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     import pycolmap
 
     try:
-        return pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(folder)
+        _require_whole_cameras(folder / "cameras.bin", model)
+        return model
     except Exception as error:
         why = " ".join(str(error).split())
         raise StageError(f"{folder} is not a readable COLMAP model ({why}); rerun the stage that writes it") from None
+
+
+def _require_whole_cameras(path: Path, model: pycolmap.Reconstruction) -> None:
+    """Raise ValueError where cameras.bin is cut short: COLMAP takes whatever numbers stand in memory for the rest."""
+    if path.is_file():
+        # A count; for each camera its number, model, width and height, and its parameters.
+        size = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+        if path.stat().st_size < size:
+            raise ValueError(f"{path.name} is cut short: {path.stat().st_size} of {size} bytes")
 
 
 def read_cameras(folder: Path) -> dict[str, pycolmap.Camera]:

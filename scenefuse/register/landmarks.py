@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.photos.workspace import posed_images, read_model
+from scenefuse.sfm.colmap import require_database
 
 # Points matched at once, and of each model at most: both bound memory.
 BLOCK_POINTS = 4096
@@ -88,6 +89,7 @@ def read_landmarks(model: Path, database: Path, max_points: int = MAX_POINTS) ->
     Raises:
         StageError: the database does not belong to the model.
     """
+    require_database(database)
     with _untouched(database) as copy, pycolmap.Database.open(copy) as opened:
 
         def descriptors(image: pycolmap.Image) -> NDArray[np.uint8]:

@@ -4,12 +4,13 @@ A run may be partial. What stands behind a missing file is from an earlier run, 
 """
 
 import itertools
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from scenefuse.core.job_records import JobRecords, why_unfinished
+from scenefuse.core.job_records import KILLED, JobRecords, last_error, why_unfinished
 from scenefuse.core.stage import StageError
 from scenefuse.report.values import Fields, find, load
 
@@ -130,6 +131,8 @@ class RunSummary:
     scenes: list[SceneSummary]
     objects: list[ObjectSummary]
     variants: list[str]
+    failed: list[str]
+    """The jobs that failed in this run, each with its error, where they are known."""
 
 
 def summarise(run: RunInputs) -> RunSummary:
@@ -167,7 +170,8 @@ def summarise(run: RunInputs) -> RunSummary:
         # Otherwise it is from before an object failed or was mended.
         if not scenes[folder.name].missing and set(find(completed, "completed.failed") or {}) == undecided:
             scenes[folder.name].fields.update(completed)
-    return RunSummary(list(scenes.values()), objects, run.variants)
+    failed = [f"{log.parent.name}/{log.stem}: {last_error(log) or KILLED}" for log in run.jobs.failed_logs]
+    return RunSummary(list(scenes.values()), objects, run.variants, failed)
 
 
 def _given(name: str, clouds: tuple[str, ...], posed: tuple[str, ...]) -> Given:
@@ -180,7 +184,7 @@ def _scene(folder: Path, run: RunInputs, given: Given) -> SceneSummary:
     maps = tuple(f"depth/{k}.json" for k in range(run.chunks)) if given == "photos" else ()
     there, missing = unbroken(folder, (*SCENE_FILES[given], *maps, "dense.json"))
     fields = read_fields(folder, [*(name for name in there if "/" not in name), *([] if missing else ["truth.json"])])
-    return SceneSummary(folder.name, fields, missing, why_unfinished(run.jobs, folder.name) if missing else "")
+    return SceneSummary(folder.name, fields, missing, _why(folder / missing, run.jobs, folder.name) if missing else "")
 
 
 def summarise_object(
@@ -223,7 +227,9 @@ def summarise_object(
         fusion = read_fields(folder, [*there[:2], *looked_for[1:]])
         fusion.pop("evidence.notes", None)
     # A variant's own log, else one of the object as a whole.
-    failed_variants = {variant: why_unfinished(jobs, f"{folder.name}-{variant}", folder.name) for variant in gaps}
+    failed_variants = {
+        variant: _why(folder / gap, jobs, f"{folder.name}-{variant}", folder.name) for variant, gap in gaps.items()
+    }
     missing = next(iter(gaps.values()), missing)
     if fusion and all("fine.status" in fields for fields in registered.values()):
         truth = read_fields(folder, ["truth.json"])
@@ -233,7 +239,7 @@ def summarise_object(
             fields |= {f"truth.{k.removeprefix(prefix)}": v for k, v in truth.items() if k.startswith(prefix)}
     unit = registered[variants[0]].get("crop.diagonal", {}).get("unit", "scene units")
     registered = {variant: _in_unit(fields, unit) for variant, fields in registered.items()}
-    failed = why_unfinished(jobs, who) if missing else ""
+    failed = _why(folder / missing, jobs, who) if missing else ""
     return ObjectSummary(folder.name, stages, registered, fusion, missing, failed, failed_variants, not scene)
 
 
@@ -258,8 +264,24 @@ def unbroken(folder: Path, names: Sequence[str]) -> tuple[list[str], str]:
 
     Snakemake removes what a rule wrote before it runs the rule again: what is behind a gap is from an earlier run.
     """
-    there = list(itertools.takewhile(lambda name: (folder / name).is_file(), names))
+    there = list(itertools.takewhile(lambda name: _readable(folder / name), names))
     return there, names[len(there)] if len(there) < len(names) else ""
+
+
+def _readable(path: Path) -> bool:
+    """Whether a file is there and, if it is JSON, whole."""
+    if path.suffix != ".json" or not path.is_file():
+        return path.is_file()
+    try:
+        json.loads(path.read_text())
+    except ValueError:
+        return False
+    return True
+
+
+def _why(path: Path, jobs: JobRecords, *names: str) -> str:
+    """Why a file is missing: it is damaged, or a job with one of these names failed."""
+    return f"{path} is damaged; delete it and run again" if path.is_file() else why_unfinished(jobs, *names)
 
 
 def read_fields(folder: Path, names: Sequence[str]) -> Fields:

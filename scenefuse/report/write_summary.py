@@ -63,7 +63,7 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
     tables = {
         "registration": registration_table(found),
         "completion": completion_table(found),
-        "runtime": runtime_table(run.jobs.benchmarks, read_forecast(run.jobs.logs / FORECAST)),
+        "runtime": runtime_table(run.jobs.benchmarks, read_forecast(summary / FORECAST)),
         "scenes": scenes_table(found.scenes, run.scenes),
         "objects": objects_table(found),
         "disk": disk_table([*run.scenes, *run.objects]),
@@ -85,6 +85,8 @@ def summary_text(run: RunSummary, tables: dict[str, pd.DataFrame]) -> str:
         lines += _heading(f"scene {row['scene']}") + _fact_lines(scene_facts(row), ON_PAGE_ONLY)
     for row in records(tables["objects"]):
         lines += _heading(f"object {row['object']}: {row['status']}") + _fact_lines(object_facts(row), ON_PAGE_ONLY)
+    if run.failed:
+        lines += _heading("jobs that failed") + [line for job in run.failed for line in _line("", job)]
     lines += _heading(_count(run.objects, run.variants[0]))
     return "\n".join([*lines, "details.txt says what the stages measured and chose; report.html shows it all."]) + "\n"
 

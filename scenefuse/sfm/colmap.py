@@ -1,13 +1,16 @@
-"""COLMAP's long calls, which a signal can end, and its bundle adjustment: the paper's, with robust weights."""
+"""COLMAP's long calls, which a signal can end, its databases, and its bundle adjustment with robust weights."""
 
+import contextlib
+import sqlite3
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pycolmap
 
-from scenefuse.core.stage import threads
+from scenefuse.core.stage import StageError, threads
 
 # He et al. 2026: iterations of a global bundle adjustment, of the linear solver within one, and its tolerance; 0 runs
 # all iterations.
@@ -93,3 +96,16 @@ def cancellable(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     if "error" in outcome:
         raise outcome["error"]
     return outcome["result"]
+
+
+def require_database(path: Path) -> None:
+    """Raise StageError where a COLMAP database is missing or damaged; COLMAP does not say which file it means."""
+    if not path.is_file():
+        raise StageError(f"{path} does not exist; run the stage that writes it first")
+    try:
+        with contextlib.closing(sqlite3.connect(path.absolute().as_uri() + "?immutable=1", uri=True)) as database:
+            wrong = database.execute("PRAGMA quick_check(1)").fetchone()[0]
+    except sqlite3.DatabaseError as error:
+        wrong = str(error)
+    if wrong != "ok":
+        raise StageError(f"{path} is damaged ({wrong}); delete it and run again")

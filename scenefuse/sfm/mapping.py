@@ -34,6 +34,7 @@ from scenefuse.sfm.colmap import (
     adjust,
     cancellable,
     drop_outliers,
+    require_database,
 )
 from scenefuse.sfm.explained import STRONG_PAIR, doubtful_photos, explained_matches
 from scenefuse.sfm.given_cameras import triangulated
@@ -92,6 +93,7 @@ def map_photos(
     Raises:
         StageError: too small a share of the photos is registered; what `triangulated` and `read_lengths` say.
     """
+    require_database(database)
     names = [p.name for p in read_photos(photos)]
     if cameras is not None:
         turned = orientations_in(read_json(photos))

@@ -23,7 +23,7 @@ from scipy.spatial.distance import cdist
 from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, setting, threads, value, write_json
 from scenefuse.photos.geodesy import local_frame
 from scenefuse.photos.photos import Photo, gps_positions, read_photos
-from scenefuse.sfm.colmap import cancellable
+from scenefuse.sfm.colmap import cancellable, require_database
 from scenefuse.sfm.features import FEW_FEATURES
 
 Pair = tuple[str, str]
@@ -82,6 +82,7 @@ def match_features(
     Raises:
         StageError: no pair of photos could be verified.
     """
+    require_database(features)
     is_video = value(read_json(photos), "kind") == "video"
     choice, reason, pairs = choose_pairs(read_photos(photos), is_video, settings)
     print(f"{choice} pairs ({reason}): {len(pairs)}", flush=True)

@@ -140,14 +140,15 @@ def register(
     }
     if not found.registered:
         content["next"] = quantity(_advice(known), "")
-    written = [out / "transform.json"]
-    write_json(written[0], content)
     print("\n".join(summary(found, given.searched, given.ups, evidence)), flush=True)
     if not found.registered:
         print(f"next       {value(content, 'next')}", flush=True)
-    written += _write(out, format, given, found, scene, seed)
+    written = _write(out, format, given, found, scene, seed)
     if fuse:
         written += _fuse(out, given, found, content, known, config)
+    # Last, so that it says registered only where all is written.
+    written.insert(0, out / "transform.json")
+    write_json(written[0], content)
     print(f"written    {', '.join(map(str, written))}", flush=True)
     return ExitStatus.REGISTERED if found.registered else ExitStatus.UNREGISTERED
 

@@ -99,6 +99,7 @@ def test_a_failed_object_keeps_nobody_back_and_is_taken_in_once_it_is_mended(pro
     failed = project()
     assert failed.returncode != 0
     scene, summary = tmp_path / "results/scenes/yard", tmp_path / "results/summary"
+    assert (scene / "completed.json").is_file(), failed.stdout[-6000:]
     report = json.loads((scene / "completed.json").read_text())
     assert list(report["added_points"]["value"]) == ["shed"] and "2.jpg" in report["failed"]["value"]["barn"]
     assert set(read_cloud(scene / "completed.ply").fields["source"]) == {0, 1}

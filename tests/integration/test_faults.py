@@ -3,6 +3,8 @@
 The stages are stubs. `make test-faults` tries many more faults, and those of the stages themselves.
 """
 
+import json
+
 import pytest
 from support.stub_stages import StubRun, stub_workflow
 
@@ -81,3 +83,18 @@ def test_results_that_were_deleted_are_made_again(finished, tmp_path, names):
         (run.path / "results/objects/shed0" / name).unlink()
     assert run.run().returncode == 0
     assert run.results() == finished.results()
+
+
+def test_a_scene_that_fails_is_not_shown_as_it_was_and_what_failed_is_printed(finished, tmp_path):
+    run = finished.copy(tmp_path / "run")
+    run.project.config["scene"]["dense_cloud"] = {"min_photos": 4}
+    run.plant("fuse_depth_maps-yard", "error")
+    run.set()
+    done = run.run()
+    assert done.returncode != 0
+    assert "failed: fuse_depth_maps: planted [results/logs/fuse_depth_maps/yard.log]" in done.stdout
+    scene = run.path / "results/scenes/yard"
+    assert not any((scene / name).exists() for name in ("dense.ply", "scene.png", "view.json", "metrics.json"))
+    logs = json.loads((run.path / "jobs.json").read_text())
+    later = [log for log in logs if "yard" in log and log.split("/")[2] in ("view_scene", "compute_scene_metrics")]
+    assert not any("error" in (run.path / log).read_text() for log in later)

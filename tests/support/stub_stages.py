@@ -17,6 +17,7 @@ from pathlib import Path
 from support.snakemake_runs import ROOT
 from support.user_project import Project
 
+RECORDS = {"logs", "benchmarks", "checkpoints"}
 # It finds its job by its log, and the files of all jobs in jobs.json.
 STUB = """\
 import hashlib, json, os, pathlib, signal, sys, time
@@ -36,9 +37,16 @@ def content(path):
 
 words = sys.argv[1:]
 read = b"".join(content(path) for path in inputs if os.path.exists(path))
-digest = hashlib.sha256(" ".join(words).encode() + read).hexdigest()
+own = pathlib.Path(__file__).read_bytes()
+digest = hashlib.sha256(" ".join(words).encode() + read + own).hexdigest()
 if fault == "error":
     sys.exit("error: planted")
+if fault.startswith("sleep "):
+    pathlib.Path(log).with_suffix(".started").touch()
+    try:
+        time.sleep(float(fault.split()[1]))
+    except KeyboardInterrupt:
+        sys.exit("error: stopped by SIGINT")
 for number, output in enumerate(outputs):
     if number and fault == "half":
         os.kill(os.getpid(), signal.SIGKILL)
@@ -48,10 +56,12 @@ for number, output in enumerate(outputs):
     (output / "part" if folder else output).write_text(digest)
 if fault in ("SIGKILL", "SIGTERM", "SIGINT"):
     os.kill(os.getpid(), signal.Signals[fault])
-if fault.startswith("parent "):
-    os.kill(os.getppid(), signal.Signals[fault.split()[1]])
+if fault == "parent SIGKILL":
+    os.kill(os.getppid(), signal.SIGKILL)
     time.sleep(0.2)
     os.kill(os.getpid(), signal.SIGKILL)
+if fault == "parent SIGTERM":
+    os.kill(os.getppid(), signal.SIGTERM)
 if fault.startswith("write "):
     pathlib.Path(fault.split()[1]).write_bytes(b"changed")
 """
@@ -82,12 +92,13 @@ class StubRun:
         folder.mkdir(parents=True, exist_ok=True)
         self.project = Project(folder)
         self.project.clicked(1)
+        self.project.config["scene"] = {"chunks": 1}
         self.set(masks={"method": "grabcut"})
 
     def set(self, **sections: object) -> None:
         """Change settings of objects."""
         self.settings |= sections
-        self.project.config |= {"scene": {"chunks": 1}, "object": self.settings}
+        self.project.config["object"] = self.settings
         self.config = self.project.write()
 
     def copy(self, folder: Path) -> "StubRun":
@@ -125,12 +136,28 @@ class StubRun:
         files = {log: [part.split(", ") for part in parts] for *parts, log in jobs}
         (self.path / "jobs.json").write_text(json.dumps(files))
 
+    def start(self) -> subprocess.Popen[str]:
+        """Start the workflow in a process group of its own."""
+        env = os.environ | {"COLUMNS": "200", "PYTHONPATH": str(ROOT)}
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        return subprocess.Popen(self.command(), text=True, env=env, start_new_session=True, **pipes)
+
+    def outputs_of(self, job: str) -> list[str]:
+        """What a stage, named RULE-JOB, makes."""
+        rule, name = job.split("-", 1)
+        return json.loads((self.path / "jobs.json").read_text())[f"results/logs/{rule}/{name}.log"][1]
+
     def results(self) -> dict[str, str]:
-        """The hash of every file in results/, hidden ones too; logs and benchmarks are records, not results."""
-        files = (file for file in (self.path / "results").rglob("*") if file.is_file())
-        return {
-            name: hashlib.sha256(file.read_bytes()).hexdigest()
-            for file in files
-            if (name := file.relative_to(self.path / "results").as_posix()).split("/")[0] not in ("logs", "benchmarks")
-            and file.name != ".snakemake_timestamp"
-        }
+        """See `results_in`."""
+        return results_in(self.path)
+
+
+def results_in(folder: Path) -> dict[str, str]:
+    """The hash of every file in results/, hidden ones too, but for logs, benchmarks and checkpoints."""
+    files = (file for file in (folder / "results").rglob("*") if file.is_file())
+    return {
+        name: hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in files
+        if (name := file.relative_to(folder / "results").as_posix()).split("/")[0] not in RECORDS
+        and file.name != ".snakemake_timestamp"
+    }

@@ -14,7 +14,7 @@ from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo, list_photos, read_photos, write_photos
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm import mapping
-from scenefuse.sfm.colmap import cancellable
+from scenefuse.sfm.colmap import cancellable, require_database
 from scenefuse.sfm.explained import doubtful_photos, explained_matches
 from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
 from scenefuse.sfm.mapping import MappingSettings, map_photos
@@ -449,3 +449,16 @@ def test_weak_pairs_are_not_used_where_strong_ones_do(tmp_path):
     report = mapped(tmp_path)
     assert value(report, "registered") == 8 and value(report, "least_matches_of_a_pair") == 30
     assert value(report, "doubtful_photos") == {}
+
+
+def test_a_database_that_is_cut_short_is_named(tmp_path):
+    path = tmp_path / "database.db"
+    with pycolmap.Database.open(path) as database:
+        database.write_camera(pycolmap.Camera(model="PINHOLE", width=4, height=4, params=[1, 1, 2, 2]))
+    require_database(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(StageError, match=r"database\.db is damaged .*; delete it and run again"):
+        require_database(path)
+    path.unlink()
+    with pytest.raises(StageError, match=r"database\.db does not exist"):
+        require_database(path)

@@ -88,14 +88,14 @@ def results(tmp_path):
     return tmp_path
 
 
-def summarise(results, names=("house", "balloon", "sculpture"), lone=(), **posed):
+def summarise(results, names=("house", "balloon", "sculpture"), lone=(), failed_logs=(), **posed):
     run = RunInputs(
         scenes=(results / "scenes/demo",),
         chunks=2,
         objects=tuple(results / "objects" / name for name in (*names, *lone)),
         scene_of=("demo",) * len(names) + ("",) * len(lone),
         variants=["full", "paper"],
-        jobs=JobRecords(results / "logs", results / "benchmarks"),
+        jobs=JobRecords(results / "logs", results / "benchmarks", failed_logs),
         **posed,
     )
     write_summary(run=run, summary=results / "summary")
@@ -332,6 +332,34 @@ def test_a_killed_job_is_named_with_its_log(results):
         "its job ended without a message: perhaps killed (out of memory?); see the log [train_depth/barn.log]" in text
     )
     assert read(summary, "registration").set_index(["object", "variant"]).loc[("barn", "full"), "status"] == "failed"
+
+
+def test_a_job_that_failed_in_this_run_is_the_cause_whatever_earlier_runs_left(tmp_path):
+    logs = [tmp_path / rule / "house.log" for rule in ("fuse_object", "train_depth")]
+    for log, text in zip(logs, ("error: of before", "Traceback\nMemoryError: Unable to allocate 2 GiB\n")):
+        log.parent.mkdir()
+        log.write_text(text)
+    why = why_unfinished(JobRecords(tmp_path, tmp_path / "none", (logs[1],)), "house")
+    assert why.startswith("the memory, or a limit on it") and why.endswith(
+        "(MemoryError: Unable to allocate 2 GiB) [train_depth/house.log]"
+    )
+    assert why_unfinished(JobRecords(tmp_path, tmp_path / "none", (logs[1],)), "barn") == ""
+
+
+def test_a_damaged_decision_is_named_and_said_to_be_so(results):
+    path = results / "objects/house/registration/full/fine.json"
+    path.write_text(path.read_text()[:40])
+    house = read(summarise(results), "registration").set_index(["object", "variant"]).loc[("house", "full")]
+    assert house["status"] == "failed" and house["reason"] == f"{path} is damaged; delete it and run again"
+
+
+def test_jobs_that_failed_are_listed_even_if_all_results_are_there(results):
+    log = results / "logs/draw_object/house.log"
+    log.parent.mkdir(parents=True)
+    log.write_text("error: no font\n")
+    summary = summarise(results, failed_logs=(log,))
+    text = " ".join((summary / "summary.txt").read_text().split())
+    assert "object house: registered" in text and "jobs that failed" in text and "draw_object/house: no font" in text
 
 
 def test_a_pose_that_nothing_checked_is_shown_as_such(results):

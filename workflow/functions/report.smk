@@ -1,9 +1,14 @@
 # What the summary reads, the command that writes it, and what is still to be done when a job has failed.
+import subprocess
+
+from scenefuse.core.job_records import KILLED, last_error
 from scenefuse.report.run_summary import (
     OBJECT_FILES,
     REGISTRATION_FILES,
     SCENE_FILES,
 )
+
+NOT_ACCEPTED = "Snakemake did not take its outputs for its reason above"
 
 
 def results_of(wildcards):
@@ -69,9 +74,9 @@ def run_options(wildcards=None):
     )
 
 
-def summary_command(log):
+def summary_command(log, options=""):
     """The shell line that writes the tables and summary.txt; also run when a job has failed, so that the summary names it."""
-    command = f"python {script('report/write_summary.py')} {run_options()}"
+    command = f"python {script('report/write_summary.py')} {run_options()}{options}"
     return f"{command} --summary results/summary &> {log}"
 
 
@@ -104,14 +109,16 @@ def mark_as_unfinished():
             workflow.persistence.started(job)
 
 
+def jobs_that_ended_badly():
+    """The jobs that failed, and those that ran when the run was stopped."""
+    ended = workflow.scheduler.failed | workflow.scheduler.running
+    return {job for jobs in ended for job in (jobs if jobs.is_group() else [jobs])}
+
+
 def record_failures():
     """Let the jobs that failed or were stopped run again whatever is asked for next, and remove the marks of those that are not
     reached by these."""
-    stopped = {
-        job
-        for jobs in workflow.scheduler.failed | workflow.scheduler.running
-        for job in (jobs if jobs.is_group() else [jobs])
-    }
+    stopped = jobs_that_ended_badly()
     for job in stopped:
         for output in job.output:
             record = workflow.persistence.metadata(output)
@@ -140,14 +147,12 @@ def forecast_run():
         kind = "object" if "object" in of else "scene"
         cost = taken.get((kind, of.get(kind)), {}).get(name, forecast.JOB_S)
         by_rule[name] = by_rule.get(name, 0) + cost
-        # Known once a job's inputs are there.
-        asked = job.resources.get("mem_mb")
-        memory[name] = max(memory.get(name, 0), asked if isinstance(asked, int) else 0)
+        memory[name] = max(memory.get(name, 0), int(job.resources.get("mem_mb", 0)))
         if job.benchmark:
             seconds[str(job.benchmark)] = cost
     if not by_rule:
         return []
-    forecast.write_forecast(Path("results/logs", forecast.FORECAST), seconds)
+    forecast.write_forecast(Path("results/summary", forecast.FORECAST), seconds)
     needed = {
         Path(f"results/{kind}s/{name}"): forecast.disk_bytes(
             kind, row, PROJECT.of(kind, name)
@@ -171,22 +176,52 @@ def held_up(rule):
 
 
 def run_anyway(job, options=""):
-    """Run a job whose inputs are not all there. Its outputs stay marked as incomplete: the next run makes them anew."""
+    """Run a job whose inputs are not all there; returns whether it ended well. Its outputs stay marked as incomplete: the next run
+    makes them anew."""
     workflow.persistence.started(job)
     folders = {str(Path(file).parent) for file in (*job.log, job.benchmark)}
     command = f"{job.shellcmd.removeprefix('exec ')}{options}"
-    # The benchmark says that the job has ended well.
-    shell(f"mkdir -p {' '.join(folders)}; {command} && touch {job.benchmark} || true")
+    try:
+        # The benchmark says that the job has ended well.
+        shell(f"mkdir -p {' '.join(folders)}; {command} && touch {job.benchmark}")
+    except subprocess.CalledProcessError:
+        return False
+    return True
 
 
-def without_the_failed(job):
-    """The option that names the objects that a job has to do without; None when the scene itself is missing."""
-    missing = [
-        Path(file).parts
-        for other, files in workflow.dag.dependencies[job].items()
-        if not workflow.dag.noneedrun_finished(other)
-        for file in files
-    ]
-    if any(parts[:2] != ("results", "objects") for parts in missing):
-        return None
-    return f" --failed {' '.join(sorted({parts[2] for parts in missing}))}"
+def finish_scenes():
+    """Complete, draw, measure and show the scenes without the objects that failed. Where the scene itself failed, its figure, view
+    and metrics of before go: the page would show them as if they were of this run."""
+    made = set()
+    takes = {"complete_scene": failed_logs(), "draw_scene": ""}
+    for rule in (*takes, "compute_scene_metrics", "view_scene"):
+        for job in held_up(rule):
+            missing = [
+                other
+                for other in workflow.dag.dependencies[job]
+                if other not in made and not workflow.dag.noneedrun_finished(other)
+            ]
+            objects = {other.wildcards.get("object") for other in missing}
+            if None not in objects:
+                without = f" --failed {' '.join(sorted(objects))}{takes.get(rule, '')}"
+                if run_anyway(job, without if rule in takes and objects else ""):
+                    made.add(job)
+            elif rule != "complete_scene":
+                for output in job.output:
+                    Path(output).unlink(missing_ok=True)
+
+
+def failed_logs():
+    """The option that names the logs of the jobs that failed."""
+    logs = sorted(log for job in jobs_that_ended_badly() for log in job.log)
+    return f" --failed-logs {' '.join(logs)}" if logs else ""
+
+
+def print_failures():
+    """Print what failed, and why."""
+    for job in sorted(jobs_that_ended_badly(), key=lambda job: job.jobid):
+        logs = [Path(log) for log in job.log if Path(log).is_file()]
+        # A job that ended well leaves its benchmark.
+        unknown = NOT_ACCEPTED if Path(job.benchmark).is_file() else KILLED
+        why = "; ".join(f"{last_error(log) or unknown} [{log}]" for log in logs)
+        print(f"failed: {job.message or job.rule.name}: {why}", file=sys.stderr)

@@ -3,6 +3,7 @@ import glob
 import os
 import re
 import shlex
+import shutil
 import sys
 from functools import cache
 from pathlib import Path
@@ -17,6 +18,9 @@ from scenefuse.core.machine import has_gpu, megapixels, memory_mb
 from scenefuse.photos.photo_files import GEO_FILE, camera_files, photo_files
 from scenefuse.core.stage import StageError
 
+# Records of the jobs and logs take so much at least.
+MIN_FREE_BYTES = 2**20
+
 # The folder above workflow/; where another workflow has fetched this one from the web, that of the installed library.
 if workflow.modifier.path_modifier.replace_prefix("results") != "results":
     raise WorkflowError(
@@ -26,6 +30,11 @@ if workflow.modifier.path_modifier.replace_prefix("results") != "results":
 if set("{}") & set(os.getcwd()):
     raise WorkflowError(
         f"Snakemake takes the braces in {os.getcwd()} for wildcards; rename the folder, or work in another one"
+    )
+# Snakemake itself, and its log of an error, would end in tracebacks.
+if shutil.disk_usage(os.getcwd()).free < MIN_FREE_BYTES:
+    sys.exit(
+        f"error: the disk of {os.getcwd()} is full; free some space and run this again"
     )
 ROOT = Path(str(workflow.current_basedir)).parents[1]
 if not (ROOT / "scripts").is_dir():

@@ -249,23 +249,18 @@ onsuccess:
 
 onerror:
     record_failures()
-    stopped = getattr(workflow.scheduler, "_user_kill", None)
+    stopped = (
+        getattr(workflow.scheduler, "_user_kill", None)
+        or workflow.scheduler.running
+    )
     keep_going = workflow.execution_settings.keep_going and not stopped
-    for job in held_up("draw_scene") + held_up("complete_scene"):
-        options = without_the_failed(job)
-        if keep_going and options:
-            run_anyway(job, options)
-    for job in held_up("compute_scene_metrics"):
-        if keep_going and Path(job.input.cloud).is_file():
-            run_anyway(job)
-    for job in held_up("view_scene"):
-        if keep_going and Path(job.input.completed).is_file():
-            run_anyway(job)
+    if keep_going:
+        finish_scenes()
     for job in held_up("write_summary"):
         workflow.persistence.started(job)
     shell(
         "mkdir -p results/logs/write_summary; "
-        + summary_command("results/logs/write_summary/onerror.log")
+        + summary_command("results/logs/write_summary/onerror.log", failed_logs())
         + " || true"
     )
     for job in held_up("compare_with_paper") if keep_going else []:
@@ -275,4 +270,5 @@ onerror:
         run_anyway(job)
     for job in held_up("write_report") if keep_going else []:
         run_anyway(job)
-    print("Some jobs failed.\n" + closing_lines(), file=sys.stderr)
+    print_failures()
+    print(closing_lines(), file=sys.stderr)
