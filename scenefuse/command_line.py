@@ -108,9 +108,7 @@ def _run() -> None:
         if not Path(path).is_file():
             sys.exit(f"error: the settings file {path} cannot be read; correct its path")
         if b"__use_yte__" in Path(path).read_bytes():
-            sys.exit(
-                f"error: {path} asks Snakemake to run Python that stands in it; remove __use_yte__ (docs/trust.md)"
-            )
+            sys.exit(f"error: {path} asks Snakemake to run Python in it; remove __use_yte__ (docs/trust.md)")
     words = [*own, *sys.argv[1:]]
     # As `python -m snakemake`, but its help and errors name the command that was typed.
     start = "import sys; sys.argv[0] = 'scenefuse run'; from snakemake.cli import main; main()"
