@@ -63,7 +63,7 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
     tables = {
         "registration": registration_table(found),
         "completion": completion_table(found),
-        "runtime": runtime_table(run.jobs.benchmarks, read_forecast(summary / FORECAST)),
+        "runtime": runtime_table(run.jobs.benchmarks, read_forecast(run.jobs.logs / FORECAST)),
         "scenes": scenes_table(found.scenes, run.scenes),
         "objects": objects_table(found),
         "disk": disk_table([*run.scenes, *run.objects]),

@@ -23,7 +23,7 @@ from snakemake.persistence.file import FilePersistence
 from support.snakemake_runs import ROOT
 from support.stub_stages import StubRun, results_in, stub_workflow
 
-from scenefuse.core.job_records import last_error
+from scenefuse.core.job_records import KILLED, last_error
 
 COLUMNS = ("stage", "fault", "stages are", "end", "a plain rerun")
 # The rule and job of each stage, its script, and an input that is cut to half.
@@ -336,7 +336,11 @@ def _run_stage(command: str, limit: str) -> tuple[int, str]:
     done = subprocess.run(["bash", "-c", limit + command.strip()], env=env)
     text, said = log.read_text(errors="replace"), last_error(log)
     os.utime(log, (times.st_atime, times.st_mtime))
-    return done.returncode, "" if "Traceback" in text and "memory" not in said else said
+    if "Traceback" in text and "memory" not in said:
+        print(text[-600:], flush=True)
+        return done.returncode, ""
+    # What the summary says of a job that a signal ended.
+    return done.returncode, said or (KILLED if done.returncode > 128 else "")
 
 
 if __name__ == "__main__":

@@ -147,12 +147,14 @@ def forecast_run():
         kind = "object" if "object" in of else "scene"
         cost = taken.get((kind, of.get(kind)), {}).get(name, forecast.JOB_S)
         by_rule[name] = by_rule.get(name, 0) + cost
-        memory[name] = max(memory.get(name, 0), int(job.resources.get("mem_mb", 0)))
+        # Known once a job's inputs are there.
+        asked = job.resources.get("mem_mb")
+        memory[name] = max(memory.get(name, 0), asked if isinstance(asked, int) else 0)
         if job.benchmark:
             seconds[str(job.benchmark)] = cost
     if not by_rule:
         return []
-    forecast.write_forecast(Path("results/summary", forecast.FORECAST), seconds)
+    forecast.write_forecast(Path("results/logs", forecast.FORECAST), seconds)
     needed = {
         Path(f"results/{kind}s/{name}"): forecast.disk_bytes(
             kind, row, PROJECT.of(kind, name)
