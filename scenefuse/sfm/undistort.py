@@ -14,7 +14,7 @@ from scenefuse.core.stage import atomic_directory, manifest, quantity, read_json
 from scenefuse.core.transforms import Array
 from scenefuse.photos.photos import check_unchanged, read_photos
 from scenefuse.photos.pictures import JPEG_QUALITY
-from scenefuse.photos.workspace import View, read_workspace
+from scenefuse.photos.workspace import View, read_model, read_workspace
 from scenefuse.sfm.colmap import cancellable
 from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 
@@ -56,6 +56,8 @@ def undistort_photos(
         StageError: a photo is missing in the folder, or has changed since it was listed.
     """
     check_unchanged(folder, read_photos(photos))
+    # COLMAP would take a model that is cut short.
+    read_model(sparse)
     with atomic_directory(workspace) as temporary:
         cancellable(
             pycolmap.undistort_images,

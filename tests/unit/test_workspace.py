@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from scenefuse.core.stage import StageError
-from scenefuse.photos.workspace import View, read_workspace, write_model
+from scenefuse.photos.workspace import View, read_model, read_workspace, write_model
 
 POINTS = np.array([[0.1, -0.2, 4.0], [0.4, 0.3, 5.0], [-0.5, 0.1, 6.0], [0.0, 0.0, -3.0], [9.0, 0.0, 4.0]])
 
@@ -114,3 +114,10 @@ def test_a_written_model_is_read_back_and_shares_its_cameras(folder, tmp_path):
         np.testing.assert_allclose(view.cam_from_world, before.cam_from_world, atol=1e-12)
         np.testing.assert_array_equal(view.intrinsics, before.intrinsics)
     assert pycolmap.Reconstruction(tmp_path / "again/sparse").num_cameras() == 2
+
+
+def test_cameras_that_are_cut_short_are_an_error(folder):
+    path = folder / "sparse/cameras.bin"
+    path.write_bytes(path.read_bytes()[:-16])
+    with pytest.raises(StageError, match=r"sparse is not a readable COLMAP model \(cameras\.bin is cut short"):
+        read_model(folder / "sparse")
