@@ -224,6 +224,8 @@ def print_failures():
     for job in sorted(jobs_that_ended_badly(), key=lambda job: job.jobid):
         logs = [Path(log) for log in job.log if Path(log).is_file()]
         # A job that ended well leaves its benchmark.
-        unknown = NOT_ACCEPTED if Path(job.benchmark).is_file() else KILLED
+        unknown = (
+            NOT_ACCEPTED if job.benchmark and Path(job.benchmark).is_file() else KILLED
+        )
         why = "; ".join(f"{last_error(log) or unknown} [{log}]" for log in logs)
         print(f"failed: {job.message or job.rule.name}: {why}", file=sys.stderr)
