@@ -139,8 +139,14 @@ class StubRun:
     def start(self) -> subprocess.Popen[str]:
         """Start the workflow in a process group of its own."""
         env = os.environ | {"COLUMNS": "200", "PYTHONPATH": str(ROOT)}
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-        return subprocess.Popen(self.command(), text=True, env=env, start_new_session=True, **pipes)
+        return subprocess.Popen(
+            self.command(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=env,
+            start_new_session=True,
+        )
 
     def outputs_of(self, job: str) -> list[str]:
         """What a stage, named RULE-JOB, makes."""
