@@ -29,8 +29,6 @@ class LossWeights:
     """Opacity against the mask."""
     sparsity_weight: float = 0.05
     """Density on rays that miss the object."""
-    distortion_weight: float = 0.01
-    """Spread of the weights along a ray: equation (15) of Mip-NeRF 360 (Barron et al. 2022), see `render.composite`."""
 
     def by_name(self) -> dict[str, float]:
         """The weights by the names of their losses."""

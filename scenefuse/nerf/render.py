@@ -146,14 +146,12 @@ class Composited:
         color: (R, 3) on black.
         opacity: (R,).
         moment: (R,) sum of w t; over the opacity it is the expected distance.
-        distortion: (R,).
         weights: (R, S) compositing weights w, without gradient.
     """
 
     color: Tensor
     opacity: Tensor
     moment: Tensor
-    distortion: Tensor
     weights: Tensor
 
     @property
@@ -165,8 +163,6 @@ class Composited:
 def composite(sigma: Tensor, rgb: Tensor, t: Tensor, delta: Tensor) -> Composited:
     """Volume rendering by quadrature: equation (3) of NeRF (Mildenhall et al. 2020).
 
-    The distortion is equation (15) of Mip-NeRF 360 (Barron et al. 2022), its double sum as running sums.
-
     Args:
         sigma: (R, S) density.
         rgb: (R, S, 3).
@@ -176,9 +172,7 @@ def composite(sigma: Tensor, rgb: Tensor, t: Tensor, delta: Tensor) -> Composite
     tau = sigma * delta
     before = torch.cumsum(tau, 1) - tau
     w = torch.exp(-before) * (1 - torch.exp(-tau))
-    mass, moment = torch.cumsum(w, 1) - w, torch.cumsum(w * t, 1) - w * t
-    distortion = (2 * w * (t * mass - moment) + w * w * delta / 3).sum(1)
-    return Composited((w[..., None] * rgb).sum(1), w.sum(1), (w * t).sum(1), distortion, w.detach())
+    return Composited((w[..., None] * rgb).sum(1), w.sum(1), (w * t).sum(1), w.detach())
 
 
 def median_distance(t: Tensor, delta: Tensor, weights: Tensor) -> Tensor:

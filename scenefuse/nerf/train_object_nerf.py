@@ -101,7 +101,7 @@ def train_object_nerf(
     """Train a NeRF of one object and render depth, normals and confidence for every photo.
 
     Instant-ngp's field (Mueller et al. 2022) in a cube around the visual hull of the masks, with the paper's losses:
-    photometric, depth, mask, sparsity, distortion (method N2 to N9). Depth is the median along
+    photometric, depth, mask, sparsity (method N2 to N9). Depth is the median along
     the ray where opacity exceeds 0.9; its confidence is opacity times the share of other views that agree.
 
     Args:

@@ -33,8 +33,6 @@ from scenefuse.nerf.render import UNIFORM_SHARE, Composited, RayPrior, RaySample
 
 # Steps between updates of the grid (Mueller et al. 2022, appendix E.2).
 OCCUPANCY_EVERY = 16
-# Samples fall to their last number by the middle of the training, when the grid knows the surface.
-SAMPLES_FALL_UNTIL = 0.5
 # The cosine ends at this share of the highest rate, not at nothing: the last steps still learn.
 FINAL_RATE_SHARE = 0.02
 # Gains and vignetting are found at these shares of a training: when depths are good enough to compare photos by, and
@@ -72,10 +70,8 @@ class NerfRecipe:
     """Highest learning rate of the networks."""
     grid_learning_rate: float = 1e-2
     """Highest learning rate of the hash grid."""
-    samples_first: int = 32
-    """Samples per ray at the start."""
-    samples_last: int = 16
-    """Samples per ray from the middle of the training on."""
+    samples: int = 16
+    """Samples per ray."""
     coarse_until: float = 0.3
     """Share of the steps after which all levels are open (method N9)."""
     prior_share: float = 0.6
@@ -316,9 +312,8 @@ def _loss_terms(nerf: Nerf, training: Training, batch: RayBatch, step: int) -> t
     """Loss terms of a batch and `psnr` in dB inside the masks, by name, each a scalar; and the number of samples."""
     rays = _rays(training.photos, batch, training.recipe.prior_share)
     device = rays.origin.device
-    count = _samples_per_ray(training.recipe, step / training.steps)
     rng = step_generator(training.seed, step)
-    jitter = torch.rand(len(rays.origin), count, generator=rng).to(device)
+    jitter = torch.rand(len(rays.origin), training.recipe.samples, generator=rng).to(device)
     background = torch.rand(len(rays.origin), 3, generator=rng).to(device)
     seen_from = _partly_turned(rays.direction, training.recipe.turned_share, rng)
     drawn = march(
@@ -330,11 +325,6 @@ def _loss_terms(nerf: Nerf, training: Training, batch: RayBatch, step: int) -> t
     if training.additions is not None:
         terms |= training.additions.losses(rendered, nerf)
     return terms | {"psnr": psnr}, drawn.t.numel()
-
-
-def _samples_per_ray(recipe: NerfRecipe, progress: float) -> int:
-    fallen = min(1, progress / SAMPLES_FALL_UNTIL)
-    return round(recipe.samples_first + (recipe.samples_last - recipe.samples_first) * fallen)
 
 
 def _rays(photos: PhotoTensors, batch: RayBatch, prior_share: float) -> Rays:
@@ -397,8 +387,6 @@ def _geometric(weights: LossWeights, rendered: Rendered) -> dict[str, Tensor]:
         terms["mask"] = losses.mask_loss(seen.opacity, batch.matte[ray])
     if weights.sparsity_weight > 0:
         terms["sparsity"] = losses.sparsity_loss(rendered.sigma, rendered.drawn.delta, batch.inside[ray])
-    if weights.distortion_weight > 0:
-        terms["distortion"] = seen.distortion.mean()
     return terms
 
 

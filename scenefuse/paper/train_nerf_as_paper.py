@@ -36,8 +36,6 @@ NERF = NerfRecipe(
     turned_share=0.0,
     appearance=False,
 )
-# It gives no weights: they are the shipped ones. The distortion is not among its losses.
-LOSSES = LossWeights(distortion_weight=0.0)
 # Where there is a GPU: instant-ngp's field, which the paper's encoding is. On a CPU, the field of `object.nerf`.
 FIELD = FieldSettings(levels=16, log2_table=19, finest=2048, width=64)
 # The paper gives no weight of its loss of relative depth.
@@ -214,7 +212,7 @@ def as_paper(settings: NerfSettings, letter: int, device: str) -> NerfSettings:
     if device == "cuda":
         field, rays = FIELD, letter
     schedule = Schedule(settings.schedule.epochs, rays)
-    return replace(settings, field=field, schedule=schedule, recipe=NERF, losses=LOSSES)
+    return replace(settings, field=field, schedule=schedule, recipe=NERF, losses=LossWeights())
 
 
 def order_and_edges(nerf: Nerf, photos: PhotoTensors) -> OrderAndEdges:

@@ -33,7 +33,7 @@ SMALL_PX = 72
 # Functions of a stage whose share is listed by itself: module, function -> part.
 PARTS = {
     ("scenefuse.nerf.prior.train_depth", "load_views"): "loading",
-    ("scenefuse.nerf.prior.train_depth", "network_inputs"): "plane sweep",
+    ("scenefuse.nerf.prior.train_depth", "network_inputs"): "stereo",
     ("scenefuse.nerf.prior.train_depth", "train_network"): "training",
     ("scenefuse.nerf.prior.train_depth", "confirm"): "refinement",
     ("scenefuse.nerf.prior.refine_depth", "load_views"): "loading",
@@ -43,7 +43,7 @@ PARTS = {
     ("scenefuse.nerf.train_object_nerf", "find_volume"): "visual hull",
     ("scenefuse.nerf.train_object_nerf", "train"): "training",
     ("scenefuse.nerf.rendered_maps", "render_view"): "rendering",
-    ("scenefuse.nerf.rendered_maps", "compare"): "confidence",
+    ("scenefuse.nerf.rendered_maps", "agreement"): "confidence",
     ("scenefuse.nerf.object_cloud", "load_views"): "loading",
     ("scenefuse.nerf.object_cloud", "refine_by_photos"): "refinement",
     ("scenefuse.nerf.object_cloud", "fuse_depths"): "fusion",

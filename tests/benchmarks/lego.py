@@ -34,10 +34,9 @@ FLAGS = {
     "rays_per_image": 128,
     "learning_rate": 1e-2,
     "grid_learning_rate": 4e-2,
-    "samples_last": 24,
+    "samples": 24,
     "coarse_until": 0.1,
     "mask_weight": 0.01,
-    "distortion_weight": 0,
     "render_samples": 48,
     "mask_band_px": 0,
 }

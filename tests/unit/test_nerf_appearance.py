@@ -97,7 +97,7 @@ def _trained(photos, sphere, steps=160):
     )
     recipe = NerfRecipe(
         images_per_batch=8, rays_per_image=64, warmup_epochs=0.2, learning_rate=1e-2, grid_learning_rate=2e-2,
-        samples_first=24, samples_last=12, mask_band_px=1,
+        samples=16, mask_band_px=1,
     )  # fmt: skip
     schedule = Schedule(epochs=2, rays_per_epoch=steps * 512 // 2)
     train(nerf, Training(photos, schedule, recipe, LossWeights(), False, 0), checkpoint=None, report=lambda line: None)

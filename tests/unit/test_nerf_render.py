@@ -31,9 +31,6 @@ def test_composite_by_hand():
     assert ray.color[0].tolist() == pytest.approx(expected, abs=1e-6)
     assert float(ray.opacity) == pytest.approx(0.9375, abs=1e-6)
     assert float(ray.moment) == pytest.approx(0.5 + 0.5 + 3 * 0.1875, abs=1e-6)
-    pairs = 2 * (0.5 * 0.25 * 1 + 0.5 * 0.1875 * 2 + 0.25 * 0.1875 * 1)
-    own = (0.25 + 0.0625 + 0.1875**2) / 3
-    assert float(ray.distortion) == pytest.approx(pairs + own, abs=1e-6)
 
 
 def test_uniform_marching_splits_the_occupied_length_evenly():

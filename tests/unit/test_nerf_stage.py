@@ -31,8 +31,7 @@ RECIPE = NerfRecipe(
     warmup_epochs=0.2,
     learning_rate=1e-2,
     grid_learning_rate=2e-2,
-    samples_first=24,
-    samples_last=12,
+    samples=16,
     mask_band_px=1,
     occupancy_cells=32,
 )

@@ -39,8 +39,7 @@ RECIPE = NerfRecipe(
     warmup_epochs=0.2,
     learning_rate=1e-2,
     grid_learning_rate=2e-2,
-    samples_first=24,
-    samples_last=12,
+    samples=16,
     mask_band_px=1,
 )
 
@@ -231,7 +230,7 @@ def test_plain_pytorch_trains_like_the_kernels(sphere, monkeypatch):
     with_kernels = _train(sphere, steps=6)[3]
     monkeypatch.setattr(kernels, "AVAILABLE", False)
     plain = _train(sphere, steps=6)[3]
-    for name in ("color", "depth", "mask", "distortion"):
+    for name in ("color", "depth", "mask", "sparsity"):
         assert plain[name] == pytest.approx(with_kernels[name], rel=0.02)
 
 

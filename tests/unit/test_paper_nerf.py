@@ -15,14 +15,15 @@ from scenefuse.nerf.field import Field, FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.rays import draw_batch
 from scenefuse.nerf.training import Nerf, NerfRecipe, Schedule, Training, new_nerf, train
-from scenefuse.paper.train_nerf_as_paper import EDGE_RATE, LOSSES, RANK_MARGIN, RANK_WEIGHT, OrderAndEdges, rank_loss
+from scenefuse.paper.train_nerf_as_paper import EDGE_RATE, RANK_MARGIN, RANK_WEIGHT, OrderAndEdges, rank_loss
 
 FIELD = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)
 RECIPE = NerfRecipe(
     images_per_batch=8, rays_per_image=64, warmup_epochs=0.2, learning_rate=1e-2, grid_learning_rate=2e-2,
-    samples_first=24, samples_last=12, mask_band_px=1, appearance=False,
+    samples=16, coarse_until=0.0, mask_band_px=1, appearance=False,
 )  # fmt: skip
 NO_ORDER = 1e-9
+WEIGHTS = LossWeights()
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +31,7 @@ def sphere():
     return sphere_views()
 
 
-def _train(sphere, steps, weights=LOSSES, scales=None, checkpoint=None, report=lambda line: None, **added):
+def _train(sphere, steps, weights=WEIGHTS, scales=None, checkpoint=None, report=lambda line: None, **added):
     use_threads(1)
     cube, hull = sphere_volume(sphere)
     photos = photos_of(sphere, cube, prior=1.0)

@@ -60,8 +60,7 @@ def test_the_constants_are_the_papers():
         images_per_batch=24, rays_per_image=170, warmup_epochs=2, learning_rate=1e-3, grid_learning_rate=1e-3,
         coarse_until=0.0, prior_share=0.0, turned_share=0.0, appearance=False,
     )  # fmt: skip
-    assert replace(LossWeights(), distortion_weight=0.0) == nerf_stage.LOSSES
-    assert RANK_WEIGHT > 0 and nerf_stage.LOSSES.depth_weight > 0 and training.SMOOTHNESS_WEIGHT == 1e-3
+    assert RANK_WEIGHT > 0 and LossWeights().depth_weight > 0 and training.SMOOTHNESS_WEIGHT == 1e-3
     preset = read_settings(ROOT / "config/paper.yaml")
     assert sum(preset["object"][f"stage{number}"]["epochs"] for number in (1, 2, 3, 4)) == 60
     assert preset["scene"]["depth_maps"] | {"max_image_size_px": 2000, "sources": 8} == preset["scene"]["depth_maps"]

@@ -223,7 +223,7 @@ use rule register_as_paper as register_variant_as_paper with:
 def state_of_compared(wildcards):
     """Params function: fingerprint of what the run compared with says of the same objects."""
     results = Path(config["evaluation"]["paper"]["compared_with"])
-    files = [results / "summary/summary.txt", results / "summary/registration.tsv"]
+    files = [results / "summary/summary.txt"]
     for folder in (results / "scenes" / name for name in SCENES):
         files += [folder / "photos.json", folder / "dense.json"]
     for folder in (results / "objects" / name for name in JOINED):
