@@ -1,13 +1,18 @@
 """Settle: a registered object is laid on what its photos and the scene's measured of the same surface (method F4)."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.icp import COLOR_WEIGHT, ScaleRange, refine_planes
 from scenefuse.geometry.surface import Surface, with_queries
-from scenefuse.register.uncertainty import half_sampling
+from scenefuse.register.decision import FineSettings
+from scenefuse.register.likelihood import MIN_PIECES, PIECES_ACROSS
+from scenefuse.register.uncertainty import Uncertainty
 
 # Pairs within these shares of the diagonal, one after the other: an object a few per cent off still settles. One that
 # would move by more than the first (RMS) is not where the registration put it.
@@ -17,12 +22,13 @@ SCALE_WIDTH = 0.05
 # Measured points that each side needs; of each side at most so many, drawn evenly, and of these those that look for a
 # partner. They are not averaged, which would round corners off.
 MIN_POINTS, MAX_POINTS, MAX_QUERIES = 200, 20000, 5000
-# An object that moves by more than this share of its diagonal was put at a wrong place, however certain that seemed: a
-# registration's position may be as uncertain as that.
-MIN_MISPLACED = 0.005
+# An object that moves by more than this share of its diagonal was put at a wrong place, however certain that seemed.
+MIN_MISPLACED = FineSettings.max_translation_sd_fraction
 # Halves of the surfaces that are settled alike, and how far their poses may spread, over the diagonal, for the scale to
 # be settled too: a roof alone does not determine how large a house is.
 HALVES, MAX_SPREAD = 6, 0.003
+# Halves begin this much too large or too small, so that a scale that stays where it is put shows itself.
+START_SCALE_FACTOR = 1.03
 
 
 def settle(
@@ -51,7 +57,7 @@ def settle(
         return None
     mine, theirs = _surface(obj, seed), _surface(scene, seed)
     pose, scales = _refined(mine, theirs, SCALE_WIDTH, diagonal), ScaleRange(1.0, SCALE_WIDTH)
-    spread = half_sampling([(mine, theirs)], pose, scales, REACHES[1] * diagonal, HALVES, seed)
+    spread = half_sampling(mine, theirs, pose, scales, REACHES[1] * diagonal, HALVES, seed)
     if spread is None or spread.size(diagonal) > MAX_SPREAD:
         pose = _refined(mine, theirs, 0.0, diagonal)
     moved = float(np.sqrt(((pose.apply(obj.points) - obj.points) ** 2).sum(1).mean())) / diagonal
@@ -77,3 +83,57 @@ def _surface(cloud: Cloud, seed: int) -> Surface:
     normals = thin.normals.astype(np.float64)
     surface = Surface(thin.points, normals, colors, cKDTree(thin.points), np.arange(len(thin)))
     return with_queries(surface, MAX_QUERIES, seed)
+
+
+def half_sampling(
+    obj: Surface, scene: Surface, pose: Sim3, scales: ScaleRange, tau: float, halves: int, seed: int
+) -> Uncertainty | None:
+    """Half-sampling (Politis, Romano 1994): refine again and again with half of the surface's pieces, drawn at random.
+
+    The deviation of a half's pose from the whole's has the spread that the whole's has from the truth. New pairs are
+    made each time; a bootstrap of fixed pairs is some five times too sure of itself.
+
+    Args:
+        obj: the object in its own frame.
+        scene: the scene around it.
+        pose: scene_from_object of the whole.
+        scales: bounds of the scale.
+        tau: see `refine_planes`.
+        halves: how many are drawn.
+        seed: of the halves.
+
+    Returns:
+        None with fewer than MIN_PIECES pieces to draw from.
+    """
+    centre, rng = obj.points.mean(0), np.random.default_rng(seed)
+    edge = float(np.linalg.norm(np.ptp(scene.points, axis=0))) / PIECES_ACROSS
+    deviations = np.zeros((halves, 7))
+    for k in range(halves):
+        half = _half(obj, scene, pose, edge, rng)
+        if half is None:
+            return None
+        factor = START_SCALE_FACTOR if k % 2 else 1 / START_SCALE_FACTOR
+        start = Sim3(factor, np.eye(3), (1 - factor) * pose.apply(centre)) @ pose
+        other = refine_planes(*half, start, scales, tau, 30, COLOR_WEIGHT)
+        deviations[k, :3] = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()
+        deviations[k, 3:6] = other.apply(centre) - pose.apply(centre)
+        deviations[k, 6] = np.log(other.scale / pose.scale)
+    return Uncertainty.of(deviations.T @ deviations / halves)
+
+
+def _half(
+    obj: Surface, scene: Surface, pose: Sim3, edge: float, rng: np.random.Generator
+) -> tuple[Surface, Surface] | None:
+    """Both surfaces with the queries in a random half of the scene's pieces, cubes of `edge`; None with too few."""
+    places = np.concatenate([scene.points, pose.apply(obj.points)])
+    piece = np.unique(np.floor(places / edge).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
+    in_scene, in_object = piece[: len(scene)], piece[len(scene) :]
+    pieces = np.unique(in_scene)
+    if len(pieces) < MIN_PIECES:
+        return None
+    chosen = np.zeros(piece.max() + 1, dtype=bool)
+    chosen[rng.permutation(pieces)[: len(pieces) // 2]] = True
+    return (
+        replace(obj, queries=obj.queries[chosen[in_object[obj.queries]]]),
+        replace(scene, queries=scene.queries[chosen[in_scene[scene.queries]]]),
+    )

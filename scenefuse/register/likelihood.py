@@ -16,7 +16,7 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, moved_about, similarity_rows
 from scenefuse.geometry.surface import Surface
 from scenefuse.register.score import SCORE_FRACTION
-from scenefuse.register.uncertainty import MIN_PIECES, PIECES_ACROSS, Uncertainty
+from scenefuse.register.uncertainty import Uncertainty
 
 # Object points from which a scene point may come: those within two deviations, at the usual spacing and noise.
 NEIGHBOURS = 24
@@ -30,6 +30,8 @@ MIN_NOISE, MIN_COLOR_NOISE = 0.75, 0.03
 # The noise settles in MIN_ROUNDS; then a step that moves the points by less than this share of it is the last.
 MAX_ROUNDS, MIN_ROUNDS, MIN_STEP = 25, 5, 0.01
 MAX_STEP_CUTS = 5
+# Pieces to the scene's diagonal, and how many there must be: what errs together stays together.
+PIECES_ACROSS, MIN_PIECES = 6, 8
 # Copies of the scene that are drawn from the object, at a pose that is known.
 PLANTED_COPIES = 4
 # Fewer scene points on the object determine nothing.

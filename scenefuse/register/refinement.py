@@ -31,7 +31,7 @@ from scenefuse.register.score import (
     best_distinct,
     score,
 )
-from scenefuse.register.uncertainty import Uncertainty, common_error, half_sampling, with_bending
+from scenefuse.register.uncertainty import Uncertainty, common_error, with_bending
 
 # Points kept of either cloud; query points of the first refinement and ranking, and of the polish.
 FINE_POINTS = 12000
@@ -39,25 +39,19 @@ POLISH_QUERY_POINTS = 3000
 # First pairing distance, as a share of the diagonal: of poses that differ by less, one finds the other.
 START_FRACTION = DISTINCT_SHIFT
 REFINE_ROUNDS, POLISH_ROUNDS = 25, 60
-# Leading poses whose turned copies are tried, copies that are refined, and hypotheses, or copies, that are polished.
-TURNED_POSES, REFINED_COPIES, POLISHED_POSES = 2, 6, 4
+# Hypotheses that are polished, and copies of the best that are.
+POLISHED_POSES = 4
 # Copies count as the best of their surroundings only: nearer ones would slide back to the pose that they are made of.
 COPY_SEPARATION_DEG = 25
-# Nearer to its place than a coarse pose, a copy is refined from a smaller pairing distance.
-COPY_START = 0.7
-# A valley that is flat in scale has several ends: the polish is repeated from both sides.
-POLISH_SCALE_FACTOR = 1.06
 # Its repetition is looked for at this spacing at most, as a share of the object's own diagonal.
 REPETITION_SPACING = 0.005
 # The coarse search stays inside the scale prior; what it found at a bound may go on by this much (natural logarithm).
 PRIOR_SLACK_LOG = 0.15
-# The score is too coarse to choose between two poses in one valley: below this share, the polish went astray.
+# The score is too coarse to choose between two poses in one valley; below this share, one is another's rival.
 MIN_SCORE_RATIO = 0.9
 # A refined pose beyond the alignment's uncertainty, which does not know how the models are bent, is near up to so many
 # times that.
 MAX_BENDING_FACTOR = 2.0
-# Halves of the surface that are registered again for the uncertainty.
-RESAMPLINGS = 8
 
 
 @dataclass(frozen=True)
@@ -95,10 +89,10 @@ class Outcome:
 def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], settings: FineSettings) -> Outcome:
     """Refine coarse poses into one, and decide whether it may be used (method R8, R9, R12, R15).
 
-    Two-way Tukey-weighted similarity ICP of every candidate; turned copies of the leaders; point-to-plane and colour
-    polish; turned copies of what is best then, and shifted ones where the object repeats itself; ranking by the two-way
-    F-score, the agreement of colours and free space; comparison with the alignment from shared features, which replaces
-    the clouds' pose where they differ; the most likely pose; the uncertainty; the gate.
+    Two-way Tukey-weighted similarity ICP of every candidate; point-to-plane and colour polish of the best; turned
+    copies of what is best then, and shifted ones where the object repeats itself; ranking by the two-way F-score, the
+    agreement of colours and free space; comparison with the alignment from shared features, which replaces the clouds'
+    pose where they differ; the most likely pose and its uncertainty; the gate.
 
     Args:
         problem: the clouds and what is known.
@@ -106,14 +100,10 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
         settings: see FineSettings.
     """
     work = _prepare(problem, candidates[0][0].scale, settings)
-    refined = work.best_first([work.refine(pose, source, work.wide) for pose, source in candidates])
-    refined = work.best_first([*refined, *work.turned(refined[:TURNED_POSES])])
+    refined = work.best_first([work.refine(pose, source) for pose, source in candidates])
     polished = work.best_first([work.polish(h) for h in refined[:POLISHED_POSES]])
-    factors = 1 / POLISH_SCALE_FACTOR, POLISH_SCALE_FACTOR
-    both_sides = [work.polish(work.resized(polished[0], factor)) for factor in factors]
-    polished = work.best_first([*polished, *both_sides])
-    # About the polished pose, whose axis is exact, rivals turn up that the copies of a rough one slid past.
-    polished = work.best_first([*polished, *(work.polish(h) for h in work.turned(polished[:1])[:POLISHED_POSES])])
+    # About a rough pose, whose axis is not exact, copies would slide past the rivals.
+    polished = work.best_first([*polished, *(work.polish(h) for h in work.turned(polished[0]))])
     polished = work.best_first([*polished, *work.shifted(polished[0])])
     ranked, uncertainty, decided_by = work.compared_with_photos(polished)
     shape = with_queries(work.obj, QUERY_POINTS, problem.seed)
@@ -138,7 +128,6 @@ def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
             with_queries(with_grid(scene, cell, reach), QUERY_POINTS, seed),
         ),
         (with_queries(obj, POLISH_QUERY_POINTS, seed), with_queries(scene, POLISH_QUERY_POINTS, seed)),
-        problem.surfaces(scale, 2 * fraction, FINE_POINTS),
         _shifts(problem, obj, fraction * diagonal / scale),
     )
 
@@ -162,7 +151,6 @@ class _Work:
         obj: the object's surface, thinned.
         searched: object and scene with few query points and grids of nearest points, for refinement and ranking.
         scored: the same with more query points and trees, for the polish and the final score.
-        coarser: both at twice the spacing, for the uncertainty.
         shifts: (3,) each, by which the object repeats itself, in its own frame.
     """
 
@@ -171,18 +159,12 @@ class _Work:
     obj: Surface
     searched: tuple[Surface, Surface]
     scored: tuple[Surface, Surface]
-    coarser: tuple[Surface, Surface]
     shifts: list[Array]
 
     @property
     def centre(self) -> Array:
         """(3,) centre of the object, in its own frame."""
         return self.obj.points.mean(0)
-
-    @property
-    def wide(self) -> float:
-        """First pairing distance, scene units."""
-        return START_FRACTION * self.problem.scene.diagonal
 
     @property
     def narrow(self) -> float:
@@ -200,19 +182,19 @@ class _Work:
         periods = [scale * float(np.linalg.norm(shift)) / self.problem.scene.diagonal for shift in self.shifts]
         return min([DISTINCT_SHIFT, *(period / 2 for period in periods)])
 
-    def refine(self, pose: Sim3, source: str, first: float) -> Hypothesis:
-        """The bottom of the valley that a pose lies in, by point pairs within `first`, scene units, and ever less."""
-        pose = refine_points(*self.searched, pose, self.problem.scales, (first, self.narrow), REFINE_ROUNDS)
+    def refine(self, pose: Sim3, source: str, first: float = START_FRACTION) -> Hypothesis:
+        """The bottom of the valley that a pose lies in, by pairs within `first` of the diagonal, and ever less."""
+        reaches = first * self.problem.scene.diagonal, self.narrow
+        pose = refine_points(*self.searched, pose, self.problem.scales, reaches, REFINE_ROUNDS)
         return Hypothesis(pose, source, self._score(pose, self.searched))
 
-    def turned(self, leaders: list[Hypothesis]) -> list[Hypothesis]:
-        """The best of the leaders' turned copies, refined."""
+    def turned(self, best: Hypothesis) -> list[Hypothesis]:
+        """The best of a pose's turned copies, refined."""
         ups = self.problem.known.ups
-        axis, steps = None if ups is None else ups[1], self.settings.turn_steps
-        copies = [pose for h in leaders for pose in turned_copies(h.pose, self.obj, axis, steps)]
+        copies = turned_copies(best.pose, self.obj, None if ups is None else ups[1], self.settings.turn_steps)
         scored = [Hypothesis(pose, "turned", self._score(pose, self.searched)) for pose in copies]
-        best = [h for h in self.best_first([*leaders, *scored], COPY_SEPARATION_DEG) if h.source == "turned"]
-        return [self.refine(h.pose, "turned", COPY_START * self.wide) for h in best[:REFINED_COPIES]]
+        apart = [h for h in self.best_first([best, *scored], COPY_SEPARATION_DEG) if h.source == "turned"]
+        return [self.refine(h.pose, "turned") for h in apart[:POLISHED_POSES]]
 
     def shifted(self, best: Hypothesis) -> list[Hypothesis]:
         """The best of a pose's copies shifted along the object's repetition, polished."""
@@ -231,28 +213,16 @@ class _Work:
     def polish(self, h: Hypothesis) -> Hypothesis:
         """The hypothesis after the last refinement, by planes and colours."""
         pose = refine_planes(*self.scored, h.pose, self.problem.scales, self.narrow, POLISH_ROUNDS, COLOR_WEIGHT)
-        after, before = (Hypothesis(p, h.source, self._score(p, self.scored)) for p in (pose, h.pose))
-        return after if after.score.total > MIN_SCORE_RATIO * before.score.total else before
-
-    def resized(self, h: Hypothesis, factor: float) -> Hypothesis:
-        """The hypothesis with the object grown about its centre."""
-        fixed = h.pose.apply(self.centre)
-        pose = Sim3(factor, np.eye(3), (1 - factor) * fixed) @ h.pose
         return Hypothesis(pose, h.source, self._score(pose, self.scored))
 
-    def settled(self, ranked: list[Hypothesis]) -> tuple[list[Hypothesis], Uncertainty | None]:
-        """The ranking with its first replaced by the most likely pose, where that is less uncertain, and how uncertain
-        it is. A most likely pose that fits worse went astray."""
+    def most_likely(self, ranked: list[Hypothesis]) -> tuple[list[Hypothesis], Uncertainty | None]:
+        """The ranking with its first replaced by the most likely pose near it, and how uncertain that is."""
         problem, best, diagonal = self.problem, ranked[0], self.problem.scene.diagonal
-        surfaces, spacing = [self.scored, self.coarser], self.settings.voxel_fraction * diagonal
-        own = half_sampling(surfaces, best.pose, problem.scales, self.narrow, RESAMPLINGS, problem.seed)
-        other = certified(*self.scored, best.pose, problem.scales, spacing, diagonal, problem.seed)
-        if other is None or (own is not None and own.size(diagonal) <= other[1].size(diagonal)):
-            return ranked, own
-        likely = Hypothesis(other[0], best.source, self._score(other[0], self.scored))
-        if likely.score.total <= MIN_SCORE_RATIO * best.score.total:
-            return ranked, own
-        return [likely, *ranked[1:]], other[1]
+        spacing = self.settings.voxel_fraction * diagonal
+        found = certified(*self.scored, best.pose, problem.scales, spacing, diagonal, problem.seed)
+        if found is None:
+            return ranked, None
+        return [Hypothesis(found[0], best.source, self._score(found[0], self.scored)), *ranked[1:]], found[1]
 
     def compared_with_photos(self, ranked: list[Hypothesis]) -> tuple[list[Hypothesis], Uncertainty | None, DecidedBy]:
         """The ranking after the alignment from shared features, the uncertainty of its first, and what decided.
@@ -266,11 +236,11 @@ class _Work:
         """
         alignment, diagonal = self.problem.known.alignment, self.problem.scene.diagonal
         if alignment is None:
-            return *self.settled(ranked), "geometry"
+            return *self.most_likely(ranked), "geometry"
         agree = alignment.agrees(ranked[0].pose, self.centre, diagonal)
         if not agree:
-            ranked = [self.polish(self.refine(alignment.pose, "photos", self.narrow)), *ranked]
-        ranked, own = self.settled(ranked)
+            ranked = [self.polish(self.refine(alignment.pose, "photos", SCORE_FRACTION)), *ranked]
+        ranked, own = self.most_likely(ranked)
         by_photos = Hypothesis(alignment.pose, "photos", self._score(alignment.pose, self.scored))
         worth = min(1.0, by_photos.score.total / max(ranked[0].score.total, 1e-12))
         strays = not alignment.agrees(ranked[0].pose, self.centre, diagonal)

@@ -1,23 +1,16 @@
-"""How uncertain a pose is: standard deviations, and their estimate by half-sampling of the surface."""
+"""How uncertain a pose is: standard deviations, what surfaces have wrong in common, how far models may be bent."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
-from scenefuse.geometry.icp import COLOR_WEIGHT, ScaleRange, refine_planes
+from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import Surface
 
-# Halves begin this much too large or too small, so that a scale that stays where it is put shows itself.
-START_SCALE_FACTOR = 1.03
-ROUNDS = 30
-# Pieces to the scene's diagonal: what errs together stays together.
-PIECES_ACROSS = 6
-MIN_PIECES = 8
 # What a surface has wrong alike all over, as a share of how far two surfaces scatter about each other.
 COMMON_ERROR = 0.2
 
@@ -108,7 +101,7 @@ def with_bending(local: Uncertainty, pose: Sim3, of_object: Array | None, of_sce
 
 
 def common_error(obj: Surface, scene: Surface, pose: Sim3, scales: ScaleRange, reach: float) -> Array:
-    """What a pose by clouds has wrong because their surfaces err common_error, about the object's centre (method R12).
+    """What a pose by clouds has wrong because their surfaces err alike, about the object's centre (method R12).
 
     Stereo fattens, smooths and displaces whole surfaces; neither their scatter nor halves of them show it. It is taken
     as a fifth of the scatter: of the RMS distance, along the object's normals, of the scene's points that lie on it.
@@ -142,67 +135,3 @@ def uncertainty_quantities(uncertainty: Uncertainty | None, length: str) -> dict
         "translation_sd": quantity(None if u is None else u.translation_sd, length),
         "covariance": quantity(None if u is None else u.covariance, f"radians, {length}, log scale"),
     }
-
-
-def half_sampling(
-    surfaces: list[tuple[Surface, Surface]],
-    pose: Sim3,
-    scales: ScaleRange,
-    tau: float,
-    resamplings: int,
-    seed: int,
-    color_weight: float = COLOR_WEIGHT,
-) -> Uncertainty | None:
-    """Half-sampling (Politis, Romano 1994): refine again and again with half of the surface's pieces, drawn at random.
-
-    The deviation of a half's pose from the whole's has the spread that the whole's has from the truth. New pairs are
-    made each time; a bootstrap of fixed pairs is some five times too sure of itself. Taking turns with differently
-    thinned clouds shows a pose that depends on the thinning, and starting 3 % too small or too large one that stays
-    where it is put.
-
-    Args:
-        surfaces: object and scene at one or more spacings, in turn.
-        pose: scene_from_object of the whole.
-        scales: bounds of the scale.
-        tau: see `refine_planes`.
-        resamplings: halves drawn.
-        seed: of the halves.
-        color_weight: see `refine_planes`.
-
-    Returns:
-        None with fewer than eight pieces to draw from.
-    """
-    centre = surfaces[0][0].points.mean(0)
-    edge = float(np.linalg.norm(np.ptp(surfaces[0][1].points, axis=0))) / PIECES_ACROSS
-    rng = np.random.default_rng(seed)
-    deviations = np.zeros((resamplings, 7))
-    for k in range(resamplings):
-        half = _half(*surfaces[k % len(surfaces)], pose, edge, rng)
-        if half is None:
-            return None
-        factor = START_SCALE_FACTOR if k // len(surfaces) % 2 else 1 / START_SCALE_FACTOR
-        start = Sim3(factor, np.eye(3), (1 - factor) * pose.apply(centre)) @ pose
-        other = refine_planes(*half, start, scales, tau, ROUNDS, color_weight)
-        deviations[k, :3] = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()
-        deviations[k, 3:6] = other.apply(centre) - pose.apply(centre)
-        deviations[k, 6] = np.log(other.scale / pose.scale)
-    covariance = deviations.T @ deviations / resamplings
-    return Uncertainty.of(covariance)
-
-
-def _half(
-    obj: Surface, scene: Surface, pose: Sim3, edge: float, rng: np.random.Generator
-) -> tuple[Surface, Surface] | None:
-    """Both surfaces with the queries in a random half of the scene's pieces, cubes of `edge`; None with too few."""
-    places = np.concatenate([scene.points, pose.apply(obj.points)])
-    piece = np.unique(np.floor(places / edge).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
-    in_scene, in_object = piece[: len(scene)], piece[len(scene) :]
-    pieces = np.unique(in_scene)
-    if len(pieces) < MIN_PIECES:
-        return None
-    chosen = np.zeros(piece.max() + 1, dtype=bool)
-    chosen[rng.permutation(pieces)[: len(pieces) // 2]] = True
-    return (
-        replace(obj, queries=obj.queries[chosen[in_object[obj.queries]]]),
-        replace(scene, queries=scene.queries[chosen[in_scene[scene.queries]]]),
-    )

@@ -17,8 +17,10 @@ from scenefuse.fuse.compare import (
 from scenefuse.fuse.fuse_object import evidence_report
 from scenefuse.fuse.measure import FIELDS, Evidence, Measured, deviations_of_pose
 from scenefuse.fuse.modes import FusionSettings, check, fuse_by_evidence
-from scenefuse.fuse.settle import settle
+from scenefuse.fuse.settle import half_sampling, settle
+from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.photo_check import Matches, moved_photos, pack
+from scenefuse.geometry.surface import prepare
 
 NOBODY = pack([])
 
@@ -154,6 +156,20 @@ def test_a_sheet_that_does_not_say_how_large_it_is_keeps_its_scale():
     plain = [Cloud(cloud.points + rng.normal(0, 0.002, cloud.points.shape), cloud.normals) for cloud in sheets]
     pose, moved = settle(*plain, plain[0].diagonal)
     assert pose.scale == pytest.approx(1.0, abs=1e-9) and moved < 0.01
+
+
+def test_spread_of_a_pose_grows_with_noise():
+    def spread(noise):
+        eggs = []
+        for rng in map(np.random.default_rng, range(2)):
+            points = rng.normal(size=(3000, 3))
+            points /= np.linalg.norm(points, axis=1, keepdims=True)
+            eggs.append(prepare(Cloud((points + noise * rng.normal(size=(3000, 3))) * [1, 1.3, 1.6]), 0.05, 0, 3000))
+        return half_sampling(*eggs, Sim3.identity(), ScaleRange(1.0, 0.2), 0.1, halves=10, seed=0)
+
+    fine, rough = spread(0.002), spread(0.02)
+    assert fine.scale_sd_log < rough.scale_sd_log
+    assert fine.covariance.shape == (7, 7) and np.allclose(fine.covariance, fine.covariance.T)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

@@ -31,7 +31,7 @@ from scenefuse.register.fine import register_finely, scale_ledger
 from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.score import color_agreement, score
-from scenefuse.register.uncertainty import COMMON_ERROR, Uncertainty, common_error, half_sampling
+from scenefuse.register.uncertainty import COMMON_ERROR, Uncertainty, common_error
 
 Z = np.array([0.0, 0.0, 1.0])
 COARSE, FINE = CoarseSettings(), FineSettings()
@@ -430,19 +430,6 @@ def test_free_space_is_read_from_the_depth_maps_of_a_workspace(tmp_path, house):
     assert found.violation(truth.apply(house.object.points)) < 0.05
     assert found.violation(lifted.apply(house.object.points)) > 0.5
     assert read_free_space(tmp_path, (tmp_path / "none",), house.scene.points, 5, 1.0) is None
-
-
-def test_spread_of_a_pose_grows_with_noise():
-    def spread(noise):
-        trial = plant("urn", 3, ground=False, noise=noise, object_points=6000, density_ratio=1.0)
-        obj, scene = surfaces(trial, 0.01 * trial.diagonal)
-        truth = trial.scene_from_object
-        scales, tau = ScaleRange(truth.scale, 0.2), 0.02 * trial.diagonal
-        return half_sampling([(obj, scene)], truth, scales, tau, resamplings=10, seed=0, color_weight=0.0)
-
-    fine, rough = spread(0.002), spread(0.01)
-    assert fine.scale_sd_log < rough.scale_sd_log
-    assert fine.covariance.shape == (7, 7) and np.allclose(fine.covariance, fine.covariance.T)
 
 
 def test_scale_ledger_names_every_estimate_and_the_winner(house):

@@ -143,21 +143,6 @@ def same(_: Any) -> Any:
     return lambda x: x
 
 
-def _one_side(both: Any) -> Any:
-    """Half-sampling on one thinning only."""
-    return lambda surfaces, *args, **kwargs: both(surfaces[:1], *args, **kwargs)
-
-
-def _without_second_turns(turned: Any) -> Any:
-    """Turned copies of the rough poses only."""
-    return lambda self, leaders: turned(self, leaders) if len(leaders) > 1 else []
-
-
-def _without_first_turns(turned: Any) -> Any:
-    """Turned copies of the polished pose only."""
-    return lambda self, leaders: turned(self, leaders) if len(leaders) == 1 else []
-
-
 def _even(_: Any) -> Any:
     """No Tukey weights: each direction sums to a half."""
 
@@ -219,10 +204,6 @@ RULES = [
     Rule("coarse: brief refinement", f"{R}.coarse.BRIEF_ROUNDS", constant(1)),
     # Refinement.
     Rule("refine: turned copies", f"{R}.refinement._Work.turned", nothing),
-    Rule("refine: turned copies of the polished", f"{R}.refinement._Work.turned", _without_second_turns),
-    Rule("refine: turned copies of the rough", f"{R}.refinement._Work.turned", _without_first_turns),
-    Rule("refine: polish again from 6 % off", f"{R}.refinement.POLISH_SCALE_FACTOR", constant(1.0)),
-    Rule("refine: polish that scores worse is dropped", f"{R}.refinement.MIN_SCORE_RATIO", constant(0.0)),
     Rule("refine: repetition", f"{R}.refinement.shifts_onto_itself", nothing),
     # ICP.
     Rule("ICP: no pairs beyond the rim", f"{G}.icp._without_overhang", lambda _: lambda *args: args[-1]),
@@ -233,11 +214,7 @@ RULES = [
     Rule("most likely pose", f"{R}.refinement.certified", lambda _: lambda *args: None),
     Rule("most likely pose: corrected by planted copies", f"{R}.likelihood._off_on_copies",
          lambda f: lambda *args: 0 * f(*args)),
-    Rule("most likely pose: dropped where it scores worse", f"{R}.refinement.MIN_SCORE_RATIO", constant(0.0)),
     # The uncertainty.
-    Rule("half-sampling", f"{R}.refinement.half_sampling", lambda _: lambda *args: None),
-    Rule("half-sampling: starts 3 % off", f"{R}.uncertainty.START_SCALE_FACTOR", constant(1.0)),
-    Rule("half-sampling: two thinnings in turn", f"{R}.refinement.half_sampling", _one_side),
     Rule("uncertainty: what surfaces have wrong alike", f"{R}.uncertainty.COMMON_ERROR", constant(0.0)),
     # The score.
     Rule("score: recall weighs more", f"{R}.score.RECALL_WEIGHT", constant(1.0)),
