@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
-from scenefuse.geometry.icp import COLOR_WEIGHT, ScaleRange, refine_planes
+from scenefuse.geometry.icp import ScaleRange, refine_planes
 from scenefuse.geometry.surface import Surface, with_queries
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.likelihood import MIN_PIECES, PIECES_ACROSS
@@ -70,7 +70,7 @@ def _refined(mine: Surface, theirs: Surface, scale_width: float, diagonal: float
     """The pose after refinement with pairs that come nearer and nearer."""
     pose = Sim3.identity()
     for reach in REACHES:
-        pose = refine_planes(mine, theirs, pose, ScaleRange(1.0, scale_width), reach * diagonal, 10, COLOR_WEIGHT)
+        pose = refine_planes(mine, theirs, pose, ScaleRange(1.0, scale_width), reach * diagonal, rounds=10)
     return pose
 
 
@@ -114,7 +114,7 @@ def half_sampling(
             return None
         factor = START_SCALE_FACTOR if k % 2 else 1 / START_SCALE_FACTOR
         start = Sim3(factor, np.eye(3), (1 - factor) * pose.apply(centre)) @ pose
-        other = refine_planes(*half, start, scales, tau, 30, COLOR_WEIGHT)
+        other = refine_planes(*half, start, scales, tau, rounds=30)
         deviations[k, :3] = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()
         deviations[k, 3:6] = other.apply(centre) - pose.apply(centre)
         deviations[k, 6] = np.log(other.scale / pose.scale)

@@ -12,16 +12,12 @@ from scenefuse.geometry.surface import Pairs, Surface, color_gain, pair
 
 # Weight of point-to-point rows beside point-to-plane rows: enough to stop sliding, too little to hold planes back.
 POINT_WEIGHT = 0.1
-# A step that moves the points by less than this share of the pairing distance is the last.
-MIN_STEP = 0.005
 # Weight of colour rows against geometry in the polish; both are in units of their own spread.
 COLOR_WEIGHT = 0.3
 # Fewer pairs than this in either direction fix no similarity.
 MIN_PAIRS = 10
 # A linearised step changes the scale by this at most (natural logarithm).
 MAX_SCALE_STEP = 0.05
-# Points of a model that are laid on a cloud.
-MAX_OWN_POINTS = 20_000
 # Of a model's points that are laid on a cloud, this share counts, those nearest: others are off its surface, or
 # mismatched.
 NEAREST_SHARE = 0.7
@@ -48,7 +44,7 @@ class ScaleRange:
 
 
 def refine_points(
-    obj: Surface, scene: Surface, start: Sim3, scales: ScaleRange, tau: tuple[float, float], rounds: int
+    obj: Surface, scene: Surface, start: Sim3, scales: ScaleRange, tau: tuple[float, float], rounds: int = 25
 ) -> Sim3:
     """Two-way ICP with Tukey weights and Horn's symmetric scale (Horn 1987), threshold shrinking from tau[0] to tau[1].
 
@@ -75,8 +71,8 @@ def refine_planes(
     start: Sim3,
     scales: ScaleRange,
     tau: float,
-    rounds: int,
-    color_weight: float,
+    color_weight: float = COLOR_WEIGHT,
+    rounds: int = 60,
 ) -> Sim3:
     """Gauss-Newton over the seven parameters: planes and points both ways, and colours along the scene's surface.
 
@@ -89,8 +85,8 @@ def refine_planes(
         start: scene_from_object to begin with.
         scales: bounds of the scale.
         tau: pairs within this distance, scene units.
-        rounds: iterations at most; a step that moves the points by less than 0.5 % of `tau` is the last.
         color_weight: weight of the colour rows; 0 for geometry alone.
+        rounds: iterations at most; a step that moves the points by less than 0.5 % of `tau` is the last.
     """
     pose = start
     for _ in range(rounds):
@@ -102,7 +98,7 @@ def refine_planes(
             system[6], system[:, 6], right[6], system[6, 6] = 0, 0, 0, 1
         step = -np.linalg.solve(system + 1e-9 * np.trace(system) / 7 * np.eye(7), right)
         pose = moved_about(pose, step, rows.centre, scales)
-        if _motion(step, rows) < MIN_STEP * tau:
+        if _motion(step, rows) < 0.005 * tau:
             break
     return pose
 
@@ -113,7 +109,7 @@ def refine_on_cloud(own: Array, points: Array, steps: int = 20, neighbours: int 
     Point to plane (Chen and Medioni 1992), of the nearest 70 % at each step (trimmed ICP, Chetverikov et al. 2005); a
     plane is fitted to the neighbours in the cloud.
     """
-    own, tree, found = own[:: max(1, len(own) // MAX_OWN_POINTS)], cKDTree(points), Sim3.identity()
+    own, tree, found = own[:: max(1, len(own) // 20_000)], cKDTree(points), Sim3.identity()
     for _ in range(steps):
         moved = found.apply(own)
         distance, near = tree.query(moved, neighbours, workers=threads())

@@ -32,11 +32,8 @@ RANSAC_SAMPLES, MAX_PROPOSALS, RANKING_MATCHES, FINALISTS = 100_000, 2000, 300, 
 MIN_EDGE_RATIO = 0.8
 # Largest reprojection error of an inlier, RMS, in pixels of the coarser photos.
 MAX_ERROR_PX = 6.0
-ROUNDS = 20
 # The gate: inliers of the best pose among the other matches, over inliers; standard deviations of scale and rotation.
 MAX_RIVAL_SHARE, MAX_SCALE_SD_LOG, MAX_ROTATION_SD_DEG = 0.5, 0.05, 3.0
-# Places alike of which GPS may settle one.
-MAX_PLACES = 10
 # Draws of photos and points for the standard deviations.
 BOOTSTRAP_DRAWS = 200
 
@@ -136,7 +133,7 @@ def align_landmarks(
         consensus = _by_gps(seen, consensus, gps, obj.looked_at(), seed)
     inliers = seen.subset(consensus.inliers)
     near = nearest(inliers, obj.looked_at(), settings.nearest_points)
-    pose = minimise_reprojection(near, consensus.pose, MAX_ERROR_PX / 2, ROUNDS)
+    pose = minimise_reprojection(near, consensus.pose, MAX_ERROR_PX / 2)
     drawn = bootstrap(near, pose, MAX_ERROR_PX / 2, centre, BOOTSTRAP_DRAWS, seed)
     # The pose that all points give shows how much the models are bent against each other.
     uncertainty = drawn.with_difference(pose, consensus.pose, centre)
@@ -167,14 +164,15 @@ def find_consensus(seen: Observations, seed: int) -> Consensus | None:
 def _by_gps(seen: Observations, consensus: Consensus, gps: GpsPose, at: Array, seed: int) -> Consensus:
     """Of a consensus and its strong rivals the one that GPS does not contradict, if there is just one."""
     poses, least = [consensus.pose], MAX_RIVAL_SHARE * consensus.inliers.sum()
+    most = 10  # places alike; GPS settles none of more
     other, rival = consensus.other, consensus.rival
-    while other is not None and rival > least and len(poses) < MAX_PLACES:
+    while other is not None and rival > least and len(poses) < most:
         poses.append(other)
         rest = seen.subset(np.min([match_errors(seen, pose) for pose in poses], axis=0) > 3 * MAX_ERROR_PX)
         other = _most_supported(rest, seed)
         rival = 0 if other is None else int((match_errors(rest, other) <= MAX_ERROR_PX).sum())
     allowed = [pose for pose in poses if gps.miss(pose, at) <= MAX_GPS_DEVIATIONS]
-    if len(poses) == 1 or len(allowed) != 1 or len(poses) == MAX_PLACES:
+    if len(poses) == 1 or len(allowed) != 1 or len(poses) == most:
         return consensus
     print(f"GPS settles which of {len(poses)} poses it is", flush=True)
     return Consensus(allowed[0], match_errors(seen, allowed[0]) <= MAX_ERROR_PX, 0, settled_by_gps=True)
@@ -204,7 +202,7 @@ def _polished(seen: Observations, pose: Sim3) -> Sim3:
         near = match_errors(seen, pose) <= limit_px
         if near.sum() < 4:
             return pose
-        pose = minimise_reprojection(seen.subset(near), pose, limit_px / 2, ROUNDS)
+        pose = minimise_reprojection(seen.subset(near), pose, limit_px / 2)
     return pose
 
 

@@ -160,6 +160,25 @@ def unless_torn(decision: Decision, with_bending: Uncertainty | None, diagonal: 
     return replace(decision, registered=False, reason=reason)
 
 
+def unless_mirrored(decision: Decision, best: Hypothesis, mirrored: Hypothesis, settings: FineSettings) -> Decision:
+    """The decision, or a refusal where the object's mirror image fits better by more than the margin.
+
+    Args:
+        decision: by the gate, on a pose by the clouds.
+        best: that pose and its scores.
+        mirrored: the best pose of the mirror image.
+        settings: the gate.
+    """
+    fit, other = best.score.total, mirrored.score.total
+    if not decision.registered or fit >= (1 - settings.min_margin) * other:
+        return decision
+    reason = (
+        f"the mirror image of the object fits better, with a score of {other:.2f} instead of {fit:.2f}: its axes are"
+        " left-handed; negate the x of all its points, or any other axis, and register it again"
+    )
+    return replace(decision, registered=False, reason=reason)
+
+
 def _rivals(
     best: Hypothesis,
     others: list[Hypothesis],

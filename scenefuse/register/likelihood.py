@@ -27,9 +27,6 @@ START_NOISE = SCORE_FRACTION
 # It never gets below this share of the object's spacing, nor that of colours (0..1) below MIN_COLOR_NOISE: samples a
 # spacing apart tell no more.
 MIN_NOISE, MIN_COLOR_NOISE = 0.75, 0.03
-# The noise settles in MIN_ROUNDS; then a step that moves the points by less than this share of it is the last.
-MAX_ROUNDS, MIN_ROUNDS, MIN_STEP = 25, 5, 0.01
-MAX_STEP_CUTS = 5
 # Pieces to the scene's diagonal, and how many there must be: what errs together stays together.
 PIECES_ACROSS, MIN_PIECES = 6, 8
 # Copies of the scene that are drawn from the object, at a pose that is known.
@@ -113,13 +110,14 @@ def most_likely(
     pose, floor = start, MIN_NOISE * spacing
     noise = Noise(START_NOISE * diagonal, 0.15, np.ones(3), np.zeros(3))
     found = explain(obj, scene, pose, noise, spacing)
-    for step in range(MAX_ROUNDS):
+    for step in range(25):
         noise = _measured_noise(obj, scene, found, floor)
         found = explain(obj, scene, pose, noise, spacing, found.partner)
         at = _derivatives(obj, scene, pose, noise, found)
         change = _newton_step(at, diagonal / 3, scales.width == 0)
         pose, found, moved = _climb(obj, scene, at, found, change, scales, spacing)
-        if step >= MIN_ROUNDS - 1 and moved * diagonal / 3 < MIN_STEP * noise.place:
+        # The noise settles in five rounds; then a step that moves the points by a hundredth of it is the last.
+        if step >= 4 and moved * diagonal / 3 < 0.01 * noise.place:
             break
     return _derivatives(obj, scene, pose, noise, found)
 
@@ -223,7 +221,7 @@ def _climb(
     spacing: float,
 ) -> tuple[Sim3, Explanation, float]:
     """The pose after a change, or a part of it, that is more likely, and how far it moves a point at the distance 1."""
-    for _ in range(MAX_STEP_CUTS):
+    for _ in range(5):
         pose = moved_about(at.pose, change, at.centre, scales)
         then = explain(obj, scene, pose, at.noise, spacing)
         if then.log_likelihood > found.log_likelihood:

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.geometry.icp import COLOR_WEIGHT, refine_planes, refine_points
+from scenefuse.geometry.icp import refine_planes, refine_points
 from scenefuse.geometry.surface import Surface, prepare, with_grid, with_queries
 from scenefuse.register.coarse import QUERY_POINTS, Candidate
 from scenefuse.register.decision import (
@@ -17,6 +18,7 @@ from scenefuse.register.decision import (
     FineSettings,
     Repetition,
     decide,
+    unless_mirrored,
     unless_torn,
 )
 from scenefuse.register.likelihood import certified
@@ -38,7 +40,6 @@ FINE_POINTS = 12000
 POLISH_QUERY_POINTS = 3000
 # First pairing distance, as a share of the diagonal: of poses that differ by less, one finds the other.
 START_FRACTION = DISTINCT_SHIFT
-REFINE_ROUNDS, POLISH_ROUNDS = 25, 60
 # Hypotheses that are polished, and copies of the best that are.
 POLISHED_POSES = 4
 # Copies count as the best of their surroundings only: nearer ones would slide back to the pose that they are made of.
@@ -52,6 +53,9 @@ MIN_SCORE_RATIO = 0.9
 # A refined pose beyond the alignment's uncertainty, which does not know how the models are bent, is near up to so many
 # times that.
 MAX_BENDING_FACTOR = 2.0
+
+# The mirror image of an object, across its y-z plane.
+MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,8 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
     ranked, uncertainty, decided_by = work.compared_with_photos(polished)
     shape = with_queries(work.obj, QUERY_POINTS, problem.seed)
     decision = decide(ranked, uncertainty, decided_by, shape, work.problem, settings, work.repetition(ranked[0].pose))
+    if decision.registered and decided_by in ("geometry", "near"):
+        decision = unless_mirrored(decision, ranked[0], work.mirror_image(ranked[0].pose), settings)
     pose, alignment = ranked[0].pose, problem.known.alignment
     by_photos = alignment is not None and pose is alignment.pose
     common = None if by_photos else common_error(*work.scored, pose, problem.scales, work.narrow)
@@ -185,7 +191,7 @@ class _Work:
     def refine(self, pose: Sim3, source: str, first: float = START_FRACTION) -> Hypothesis:
         """The bottom of the valley that a pose lies in, by pairs within `first` of the diagonal, and ever less."""
         reaches = first * self.problem.scene.diagonal, self.narrow
-        pose = refine_points(*self.searched, pose, self.problem.scales, reaches, REFINE_ROUNDS)
+        pose = refine_points(*self.searched, pose, self.problem.scales, reaches)
         return Hypothesis(pose, source, self._score(pose, self.searched))
 
     def turned(self, best: Hypothesis) -> list[Hypothesis]:
@@ -202,6 +208,32 @@ class _Work:
         scored = [Hypothesis(pose, "shifted", self._score(pose, self.searched)) for pose in poses]
         return [self.polish(h) for h in sorted(scored, key=lambda h: -h.score.total)[:POLISHED_POSES]]
 
+    def mirror_image(self, pose: Sim3) -> Hypothesis:
+        """The best pose of the object's mirror image near a pose, mirrored across its principal planes and turned.
+
+        Axes that are left-handed make an object its mirror image; one that is nearly symmetric fits that way too.
+        """
+        ups, (searched, scene), (scored, _) = self.problem.known.ups, self.searched, self.scored
+        known = replace(self.problem.known, ups=None if ups is None else (ups[0] * MIRROR, ups[1]))
+        obj, few, more = (_mirrored(surface) for surface in (self.obj, searched, scored))
+        image = replace(
+            self,
+            problem=replace(self.problem, known=known),
+            obj=obj,
+            searched=(few, scene),
+            scored=(more, self.scored[1]),
+            shifts=[shift * MIRROR for shift in self.shifts],
+        )
+        found = []
+        for axis in np.linalg.svd(self.obj.points - self.centre, full_matrices=False)[2]:
+            # The mirror image across this plane, laid on the object.
+            rotation = pose.rotation @ (np.eye(3) - 2 * np.outer(axis, axis)) @ np.diag(MIRROR)
+            shift = 2 * pose.scale * pose.rotation @ axis * (axis @ self.centre)
+            start = Sim3(pose.scale, rotation, pose.translation + shift)
+            found.append(image.refine(start, "mirrored"))
+        best = image.best_first(found)[0]
+        return image.polish(image.best_first([best, *image.turned(best)])[0])
+
     def repetition(self, pose: Sim3) -> Repetition:
         """What the object's repetition leaves open of a pose."""
         if not self.shifts:
@@ -212,7 +244,7 @@ class _Work:
 
     def polish(self, h: Hypothesis) -> Hypothesis:
         """The hypothesis after the last refinement, by planes and colours."""
-        pose = refine_planes(*self.scored, h.pose, self.problem.scales, self.narrow, POLISH_ROUNDS, COLOR_WEIGHT)
+        pose = refine_planes(*self.scored, h.pose, self.problem.scales, self.narrow)
         return Hypothesis(pose, h.source, self._score(pose, self.scored))
 
     def most_likely(self, ranked: list[Hypothesis]) -> tuple[list[Hypothesis], Uncertainty | None]:
@@ -257,6 +289,12 @@ class _Work:
         """How well a pose explains both clouds."""
         tau = self.settings.score_fraction * self.problem.scene.diagonal
         return score(*surfaces, pose, tau, self.problem.scales.centre, self.problem.known.free_space)
+
+
+def _mirrored(surface: Surface) -> Surface:
+    """The mirror image of a surface."""
+    points = surface.points * MIRROR
+    return replace(surface, points=points, normals=surface.normals * MIRROR, tree=cKDTree(points), grid=None, slopes=[])
 
 
 def _refuted(h: Hypothesis) -> bool:

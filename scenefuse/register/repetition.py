@@ -19,13 +19,12 @@ from scenefuse.register.score import color_agreement, f_beta, worth
 VOXEL_SPACINGS = 4 / 3
 # Cells of the autocorrelation at most; of more, the voxels are larger. Shifts below so many voxels are not looked for.
 MAX_CELLS, MIN_SHIFT_VOXELS = 1_000_000, 3
-# A shift is looked at when this share of the object's voxels meet, and so much less of them on the way to it: a plane
-# that slides along itself does not repeat.
-MIN_MEETING, MIN_DIP = 0.3, 0.02
-# Shifts that are looked at, directions kept, and rounds that refine a shift.
-MAX_PEAKS, MAX_DIRECTIONS, ROUNDS = 8, 3, 20
+# A shift is looked at when this share of the object's voxels meet.
+MIN_MEETING = 0.3
+# Shifts that are looked at.
+MAX_PEAKS = 8
 # It repeats when it meets its shifted self about as closely as points of one surface lie apart, and on the way there so
-# much less closely, within half the distance.
+# much less: a plane that slides along itself does not repeat.
 MIN_SELF_AGREEMENT, MIN_CONTRAST = 0.96, 0.03
 # Where two clouds end along a direction, as percentiles: strays do not count.
 END_PERCENTILES = 1, 99
@@ -49,14 +48,14 @@ def shifts_onto_itself(obj: Surface, spacing: float) -> list[Array]:
         if any(_is_multiple(shift, of, 2 * voxel) for of in found):
             continue
         start = Sim3(1.0, np.eye(3), shift)
-        refined = refine_planes(obj, obj, start, ScaleRange(1.0, 0.0), 2 * voxel, ROUNDS, 0.0)
+        refined = refine_planes(obj, obj, start, ScaleRange(1.0, 0.0), 2 * voxel, color_weight=0.0)
         shift = refined.apply(obj.points.mean(0)) - obj.points.mean(0)
         length = float(np.linalg.norm(shift))
         if length < MIN_SHIFT_VOXELS * voxel or any(_is_multiple(shift, of, 2 * voxel) for of in found):
             continue
         if _repeats(obj, shift, 2 * voxel):
             found.append(shift)
-        if len(found) == MAX_DIRECTIONS:
+        if len(found) == 3:  # directions that are independent
             break
     return found
 
@@ -87,7 +86,7 @@ def _peaks(obj: Surface, voxel: float) -> list[Array]:
     step = step[ahead & (np.linalg.norm(step, axis=1) >= MIN_SHIFT_VOXELS)]
     way = step[:, None] * np.linspace(0.1, 0.9, 9)[:, None]
     least = map_coordinates(share, np.moveaxis(way, 2, 0), order=1, mode="grid-wrap").min(1)
-    step = step[share[tuple(step.T)] - least > MIN_DIP]
+    step = step[share[tuple(step.T)] - least > MIN_CONTRAST]
     order = np.argsort(-meeting[tuple(step.T)], kind="stable")[:MAX_PEAKS]
     return [voxel * step[k] @ axes for k in order]
 

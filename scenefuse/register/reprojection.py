@@ -107,7 +107,7 @@ def match_errors(seen: Observations, scene_from_object: Sim3) -> Array:
     return np.sqrt(np.maximum(*sides))
 
 
-def minimise_reprojection(seen: Observations, start: Sim3, width_px: float, rounds: int) -> Sim3:
+def minimise_reprojection(seen: Observations, start: Sim3, width_px: float, rounds: int = 20) -> Sim3:
     """Gauss-Newton over the seven parameters with Cauchy weights of `width_px`, damped where it does not improve."""
     pose, damping = start, 1e-6
     cost = _cost(seen, pose, width_px)

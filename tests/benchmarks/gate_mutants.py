@@ -64,7 +64,12 @@ def _body(module: types.CodeType, function: Callable[..., Any]) -> types.CodeTyp
 def caught() -> str | None:
     """What notices that the gate is wrong: the first of its test's cases that fails, or None."""
     checks = [(case.name, lambda case=case: test_gate.check(case)) for case in test_gate.CASES]
-    for name, check in [*checks, ("reported", test_gate.check_reported), ("torn", test_gate.check_torn)]:
+    for name, check in [
+        *checks,
+        ("reported", test_gate.check_reported),
+        ("torn", test_gate.check_torn),
+        ("mirrored", test_gate.check_mirrored),
+    ]:
         try:
             check()
         except Exception:

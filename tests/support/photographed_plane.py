@@ -1,5 +1,7 @@
 """A painted plane z = 0 photographed from above, for checks of points in photos; rays and colours are exact."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 
@@ -28,6 +30,13 @@ def photographs(
 
     panel: height of a painted panel of 2 PANEL x 2 PANEL above the origin, if there is one.
     """
+    return list(_photographs(count, height, size, radius, noise, panel))
+
+
+@cache
+def _photographs(
+    count: int, height: float, size: int, radius: float, noise: float, panel: float | None
+) -> tuple[View, ...]:
     rng = np.random.default_rng(0)
     views = []
     for k in range(count):
@@ -53,4 +62,4 @@ def photographs(
         grey = cv2.resize(np.where(rays[..., 2] < 0, seen, 255.0), (size, size), interpolation=cv2.INTER_AREA)
         pixels = np.clip(np.rint(grey + rng.normal(0, noise, grey.shape)), 0, 255).astype(np.uint8)
         views.append(View(f"{k}.png", intrinsics, pose, size, size, pixels))
-    return views
+    return tuple(views)

@@ -18,7 +18,7 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import Surface
 from scenefuse.register import decision as gate
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
-from scenefuse.register.decision import Decision, FineSettings, Repetition, decide, unless_torn
+from scenefuse.register.decision import Decision, FineSettings, Repetition, decide, unless_mirrored, unless_torn
 from scenefuse.register.problem import Alignment, Constraints, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.score import DISTINCT_ANGLE_DEG, DISTINCT_SCALE_LOG, DISTINCT_SHIFT, Hypothesis, Score
@@ -243,6 +243,25 @@ def check_torn() -> None:
     assert unless_torn(refused, bent[1], DIAGONAL) is refused
 
 
+def check_mirrored() -> None:
+    """An object whose mirror image fits better by more than the margin is refused, and nothing else changes."""
+    good = Decision(True, "good", "geometry", 1.0, None, None)
+    best = Hypothesis(shift(0, 0, 0), "planted", Score(0.8, 0.8, 0.8, 0.9, 0.05, 0.5))
+    least, more = (
+        replace(best, score=replace(best.score, total=0.5 / (1 - SETTINGS.min_margin) * factor))
+        for factor in (1, 1.001)
+    )
+    assert unless_mirrored(good, best, least, SETTINGS) is good
+    refused = unless_mirrored(good, best, more, SETTINGS)
+    assert not refused.registered and "left-handed; negate the x" in refused.reason
+    bad = replace(good, registered=False, reason="too little")
+    assert unless_mirrored(bad, best, more, SETTINGS) is bad
+
+
+def test_an_object_whose_mirror_image_fits_better_is_refused_with_what_to_do():
+    check_mirrored()
+
+
 def test_an_accepted_pose_is_reported_with_what_decided_and_what_stays_open():
     check_reported()
 
@@ -286,6 +305,22 @@ def mirrored(cloud):
 def test_a_mirror_image_of_the_object_is_refused(house):
     outcome = registered(mirrored(house.object), house.scene, house.up_in_object * [-1, 1, 1])
     assert not outcome.decision.registered
+
+
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_the_mirror_image_of_a_nearly_symmetric_object_is_named_as_that(is_mirrored):
+    trial = plant("wall", 3, ground=False, noise=0.005, object_points=4000, density_ratio=1.0)
+    flip = np.array([-1.0, 1, 1]) if is_mirrored else np.ones(3)
+    obj = mirrored(trial.object) if is_mirrored else trial.object
+    # The wall's own plane of symmetry lies across its length.
+    across = trial.scene_from_object.rotation.T @ X
+    laid = np.eye(3) - 2 * np.outer(across, across) if is_mirrored else np.eye(3)
+    middle, truth = trial.object.points.mean(0), trial.scene_from_object
+    rotation = truth.rotation @ laid @ np.diag(flip)
+    start = Sim3(truth.scale, rotation, truth.apply(middle) - truth.scale * rotation @ (middle * flip))
+    decision = registered(obj, trial.scene, trial.up_in_object * flip, [(start, "planted")]).decision
+    assert decision.registered != is_mirrored, decision.reason
+    assert ("mirror image" in decision.reason) == is_mirrored
 
 
 def test_an_object_that_lies_upside_down_in_the_scene_is_refused_where_gravity_is_known_and_found_elsewhere(house):

@@ -99,7 +99,6 @@ def test_too_few_points_determine_nothing(gate):
 
 def test_the_most_likely_pose_is_taken_and_without_one_the_object_is_refused(gate, monkeypatch):
     trial, truth = gate[0], gate[0].scene_from_object
-    monkeypatch.setattr(refinement, "POLISH_ROUNDS", 5)
     problem = Problem(trial.object, trial.scene, ScaleRange(truth.scale, 0.3))
     settings = replace(FineSettings(), turn_steps=3, voxel_fraction=0.02)
 

@@ -35,7 +35,13 @@ def photographed(arc, count=24, waves=30.0):
     return pack(views), silhouettes
 
 
-def ball(count=20000):
+@pytest.fixture(autouse=True)
+def coarse_cells(monkeypatch):
+    """Cells of an 80th of the diagonal, for speed."""
+    monkeypatch.setattr("scenefuse.fuse.missing.CELLS", 80)
+
+
+def ball(count=14000):
     """Points spread evenly over the sphere."""
     k = np.arange(count) + 0.5
     height, turn = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
