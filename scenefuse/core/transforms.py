@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+# Opposite to gravity in a levelled frame.
+UP: Array = np.array([0.0, 0.0, 1.0])
 # Standard deviation of a normal error over the median of its size.
 SD_OVER_MEDIAN = 1.4826
 

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from scenefuse.cloud.clouds import Cloud, spacing
 from scenefuse.core.stage import setting, threads
-from scenefuse.core.transforms import Array, rotation_between
+from scenefuse.core.transforms import UP, Array, rotation_between
 from scenefuse.geometry.ground import Ground, fit_ground
 
 # The box is widened, beside `margin`, by two pairing distances of the registration: a share of its diagonal.
@@ -102,7 +102,7 @@ def crop_cloud(
     scene: Cloud, fiducials: Array, up: Array, settings: CropSettings, other: NDArray[np.bool_] | None = None
 ) -> Crop:
     """The points of a scene that belong to the object marked by fiducials (F, 3), without those known to be `other`."""
-    level = rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    level = rotation_between(up, UP)
     if settings.shape == "oriented" and not settings.minimal:
         level = least_footprint(fiducials @ level.T) @ level
     points, marks = scene.points @ level.T, fiducials @ level.T

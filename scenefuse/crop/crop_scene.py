@@ -11,7 +11,7 @@ from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.cloud.crs import to_wgs84
 from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import UP, Array, Sim3
 from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole, without_strays
 from scenefuse.crop.one_photo import MAX_GROWTH, SceneClicks, crop_grown, locate_clicks
 from scenefuse.crop.vote import read_masked_views, vote
@@ -19,7 +19,6 @@ from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
 from scenefuse.marks.triangulation import locate
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
 
-UP = np.array([0.0, 0.0, 1.0])
 # Fewer points than this give no features to register by.
 MIN_POINTS = 200
 MIN_FIDUCIALS = 4

@@ -14,12 +14,12 @@ from scenefuse.cloud.readers.columns import AT_ONCE
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import atomic_file, quantity, read_json, threads, value, write_json
-from scenefuse.core.transforms import Array, Sim3, rotation_between
+from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.fuse.fuse_object import photos_of
 from scenefuse.fuse.measure import with_normals
 from scenefuse.fuse.missing import Lack, Missing, find_missing_surface
 from scenefuse.fuse.modes import around
-from scenefuse.fuse.next_photos import CLEARANCE, UPWARDS, Plan, plan_stations, reach_of_stations
+from scenefuse.fuse.next_photos import CLEARANCE, Plan, plan_stations, reach_of_stations
 from scenefuse.fuse.write import added_by, read_changes, together
 from scenefuse.geometry.photo_check import Photos
 from scenefuse.photos.geodesy import GridFrame, LocalFrame, length_unit, scene_frame
@@ -174,7 +174,7 @@ def photo_rows(
 ) -> list[dict[str, Any]]:
     """A row for each photo; up: (3,) direction opposite to gravity, scene frame; `gps_higher`: metres by which the
     flight's GPS counts heights higher than the scene."""
-    rows, level = [], rotation_between(up, UPWARDS)
+    rows, level = [], rotation_between(up, UP)
     highest = max((float(view.centre @ up) for view in close_ups), default=0.0)
     for number, station in enumerate(plan.stations, 1):
         for view in station.photos:

@@ -13,6 +13,7 @@ from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.icp import similarity_rows
 from scenefuse.geometry.photo_check import Matches, Photos, match_in
+from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
 
 
 class Evidence(IntEnum):
@@ -29,8 +30,6 @@ FIELDS = ("photos", "match", "deviation", "world_deviation", "evidence")
 # A point is measured where photos confirm this share of it and its neighbours: here and there one matches by chance.
 # Neighbours are as many as a plane has within SUPPORT_RADIUS of the object's diagonal, from MIN_ to MAX_NEIGHBOURS.
 SUPPORT, SUPPORT_RADIUS, MIN_NEIGHBOURS, MAX_NEIGHBOURS = 0.5, 0.01, 8, 64
-# Neighbours that a missing normal is fitted to.
-NORMAL_POINTS = 16
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ def with_normals(cloud: Cloud) -> Cloud:
         return cloud
     if len(cloud) < 3:
         return replace(cloud, normals=np.tile(np.array([0, 0, 1], np.float32), (len(cloud), 1)))
-    index = cKDTree(cloud.points).query(cloud.points, k=min(NORMAL_POINTS, len(cloud)), workers=threads())[1]
+    index = cKDTree(cloud.points).query(cloud.points, k=min(NORMAL_NEIGHBOURS, len(cloud)), workers=threads())[1]
     return replace(cloud, normals=plane_normals(cloud.points, index).astype(np.float32))
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample
-from scenefuse.core.transforms import Array, look_at, rotation_between
+from scenefuse.core.transforms import UP, Array, look_at, rotation_between
 from scenefuse.fuse.missing import SPARSEST, Lack, Missing
 from scenefuse.geometry.depth_test import shown_in
 from scenefuse.photos.workspace import View
@@ -30,7 +30,6 @@ BESIDE_DIAGONALS = 0.6
 MIN_NEW_ANGLE_DEG = 15.0
 # Stations at most, and the share of what is missing that one must add.
 MAX_STATIONS, MIN_GAIN = 6, 0.05
-UPWARDS = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ def _around(middle: Array, distance: float, up: Array) -> Array:
     height, turn = 1 - 2 * number / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * number
     flat = np.sqrt(1 - height**2)
     directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
-    directions = directions[height > np.sin(np.radians(MIN_ELEVATION_DEG))] @ rotation_between(UPWARDS, up).T
+    directions = directions[height > np.sin(np.radians(MIN_ELEVATION_DEG))] @ rotation_between(UP, up).T
     return np.concatenate([middle + factor * distance * directions for factor in sorted(DISTANCES)])
 
 
@@ -135,7 +134,7 @@ class _Free:
 
     def __init__(self, obstacles: Array, middle: Array, diagonal: float, up: Array):
         self.middle, self.diagonal, self.clearance = middle, diagonal, CLEARANCE * diagonal
-        self.level_from_scene = rotation_between(up, UPWARDS)
+        self.level_from_scene = rotation_between(up, UP)
         self.level = obstacles @ self.level_from_scene.T
         self.near, self.below = cKDTree(obstacles), cKDTree(self.level[:, :2])
 

@@ -11,6 +11,9 @@ from scenefuse.cloud.clouds import Cloud, plane_normals, voxel_average
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
 
+# Neighbours that a plane is fitted to for a normal.
+NORMAL_NEIGHBOURS = 16
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -107,7 +110,7 @@ def prepare(cloud: Cloud, voxel: float, seed: int, most: int) -> Surface:
     if len(thin) > most:
         thin = thin[np.sort(np.random.default_rng(seed).choice(len(thin), most, replace=False))]
     tree = cKDTree(thin.points)
-    neighbours = tree.query(thin.points, k=min(16, len(thin)), workers=threads())[1]
+    neighbours = tree.query(thin.points, k=min(NORMAL_NEIGHBOURS, len(thin)), workers=threads())[1]
     normals = plane_normals(thin.points, neighbours)
     outward = thin.points - thin.points.mean(0) if thin.normals is None else thin.normals
     normals = np.where(((normals * outward).sum(1) < 0)[:, None], -normals, normals)

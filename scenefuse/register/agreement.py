@@ -9,9 +9,8 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, plane_normals, sampled, spacing
 from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
 
-# Neighbours that a plane is fitted to for a normal.
-NORMAL_NEIGHBOURS = 16
 # Points at which the normals of both clouds together are compared with their neighbours'.
 MAX_COMPARED_POINTS = 20000
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from scenefuse.core.stage import quantity, threads, write_json
-from scenefuse.core.transforms import Array, Sim3, rotation_between
+from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.geometry.icp import ScaleRange, refine_points
 from scenefuse.geometry.ransac import triples_of_one_scale
 from scenefuse.geometry.surface import Surface, prepare, with_grid, with_queries
@@ -137,7 +137,7 @@ def _upright(problem: Problem, settings: CoarseSettings) -> list[Sim3]:
     ups, scales, voxel = problem.known.ups, problem.scales, SWEEP_VOXEL_FRACTION * problem.scene.diagonal
     if ups is None:
         return []
-    level = Sim3(1.0, rotation_between(ups[1], np.array([0.0, 0.0, 1.0])), np.zeros(3))
+    level = Sim3(1.0, rotation_between(ups[1], UP), np.zeros(3))
     obj, scene = problem.surfaces(scales.centre, SWEEP_VOXEL_FRACTION / 2, COARSE_POINTS)
     steps, most = (settings.scale_steps, settings.yaw_steps), settings.candidates // 2
     found = upright_candidates(obj, scene.transformed(level), ups[0], scales, *steps, voxel, most)
@@ -273,7 +273,7 @@ def upright_candidates(
         voxel: edge of a voxel, scene units.
         keep: most candidates returned, best first.
     """
-    upright = rotation_between(up_in_object, np.array([0.0, 0.0, 1.0]))
+    upright = rotation_between(up_in_object, UP)
     centre = obj.points.mean(0)
     points = (obj.points - centre) @ upright.T
     factors = scales.centre * np.exp(np.linspace(-scales.width, scales.width, scale_steps if scales.width else 1))

@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, voxel_downsample
 from scenefuse.core.stage import StageError, quantity, read_json, value
-from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg, rotation_between
+from scenefuse.core.transforms import UP, Array, Sim3, rotation_angle_deg, rotation_between
 from scenefuse.geometry.depth_test import FreeSpace
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import Surface, prepare
@@ -209,8 +209,7 @@ def estimates(obj: Cloud, scene: Cloud, ups: tuple[Array, Array] | None) -> list
     if ups is None:
         extents = {"hull": [_hull_size(p) for p in (even_obj, even_scene)]}
     else:
-        z = np.array([0.0, 0.0, 1.0])
-        level = [p @ rotation_between(up, z).T for p, up in zip((even_obj, even_scene), ups)]
+        level = [p @ rotation_between(up, UP).T for p, up in zip((even_obj, even_scene), ups)]
         extents = {
             "footprint": [_hull_size(p[:, :2]) for p in level],
             "height": [float(np.ptp(np.percentile(p[:, 2], [1, 99]))) for p in level],

@@ -12,7 +12,7 @@ from scenefuse.cloud.clouds import Cloud, has_unit_normals, occupied_voxels, rea
 from scenefuse.cloud.readers.text import TEXTS
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity, threads
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import UP, Array, Sim3
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import MIN_POINTS, around_marks, crop_marked
 from scenefuse.geometry.icp import ScaleRange
@@ -253,7 +253,7 @@ def cut_scene(
         return scene, f"the whole scene, {total} points, as if it showed little but the object"
     names, marks = _fiducials(fiducials)
     if up_in_scene is None:
-        settings, up_in_scene = replace(settings, remove_ground=False), np.array([0.0, 0.0, 1.0])
+        settings, up_in_scene = replace(settings, remove_ground=False), UP
     origin = np.floor(marks.mean(0))
     near = replace(scene, points=scene.points - origin)
     cut = crop_marked(near, names, marks - origin, up_in_scene, settings, fiducials)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from scenefuse.core.stage import quantity, threads
-from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
+from scenefuse.core.transforms import UP, Array, Sim3, rotation_angle_deg
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import Surface
 
@@ -49,7 +49,7 @@ class Uncertainty:
     def even(cls, scale_sd_log: float, rotation_sd_deg: float, translation_sd: float) -> "Uncertainty":
         """The same in all directions."""
         variances = np.array([np.radians(rotation_sd_deg)] * 3 + [translation_sd] * 3 + [scale_sd_log]) ** 2
-        return cls(scale_sd_log, rotation_sd_deg, np.array([0.0, 0.0, 1.0]), translation_sd, np.diag(variances))
+        return cls(scale_sd_log, rotation_sd_deg, UP, translation_sd, np.diag(variances))
 
     def size(self, diagonal: float) -> float:
         """One number to compare by: how far it moves a point half a diagonal off the centre, over the diagonal."""
