@@ -66,8 +66,8 @@ def with_canopy():
 def test_an_object_whose_distinctive_part_the_scene_lacks_is_rejected_for_its_half_turned_rival(with_canopy):
     outcome = register(with_canopy, hut(False, 1))
     decision, best = outcome.decision, outcome.ranked[0].pose
-    assert not decision.registered and decision.margin < FINE.min_margin
-    assert decision.reason.startswith("another pose is nearly as good: the margin is 0.0")
+    assert not decision.registered and abs(decision.margin) < FINE.min_margin
+    assert decision.reason.startswith("another pose is nearly as good")
     # Which of the two scores more is chance.
     first, second = (best, decision.rival.pose) if is_at(best, TRUTH, with_canopy) else (decision.rival.pose, best)
     assert is_at(first, TRUTH, with_canopy) and is_at(second, TURNED, with_canopy)
