@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.core.stage import atomic_file, value
-from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
+from scenefuse.core.transforms import Array, Sim3, rotation_between
 from scenefuse.report.page import document, figure, view_section
 from scenefuse.report.values import flatten, number
 from scenefuse.report.view import REMOVED, VIEW_POINTS, View, merge, thin, within
