@@ -369,7 +369,7 @@ def test_what_surfaces_have_wrong_alike_is_a_share_of_their_scatter_and_only_of_
 
 def test_photos_at_whose_pose_the_clouds_lie_worse_must_be_that_much_less_uncertain(house, by_clouds):
     truth = house.scene_from_object
-    beside = Sim3(1.0, np.eye(3), np.array([0.03 * house.diagonal, 0, 0])) @ truth
+    beside = Sim3(1.0, np.eye(3), np.array([0.025 * house.diagonal, 0, 0])) @ truth
     centre, alone = house.object.points.mean(0), by_clouds
     for share, by_photos in ((0.9, False), (0.05, True)):
         sd = share * alone.uncertainty.size(house.scene.diagonal) * house.scene.diagonal
