@@ -16,7 +16,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 from snakemake.persistence.file import FilePersistence
@@ -343,6 +342,8 @@ def _run_stage(command: str, limit: str) -> tuple[int, str]:
     return done.returncode, said or (KILLED if done.returncode > 128 else "")
 
 
+PARTS: dict[str, Callable[..., int]] = {"workflow": workflow, "stages": stages}
+
 if __name__ == "__main__":
-    part: Annotated[str, tyro.conf.Positional] = sys.argv.pop(1)
-    sys.exit(bool(tyro.cli({"workflow": workflow, "stages": stages}[part], config=(tyro.conf.OmitArgPrefixes,))))
+    part = PARTS[sys.argv.pop(1)]
+    sys.exit(bool(tyro.cli(part, config=(tyro.conf.OmitArgPrefixes,))))
