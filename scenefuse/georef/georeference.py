@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from scenefuse.cloud.crs import check_in_area, grid_name, projected_crs
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, value, write_json
-from scenefuse.core.transforms import box_corners, fit_sim3
+from scenefuse.core.transforms import UP, box_corners, fit_sim3
 from scenefuse.georef.adjust import SurveyedPhotos, SurveyedPoints, adjust_to_survey
 from scenefuse.georef.control import Control, read_control_points
 from scenefuse.georef.on_cloud import lay_on_cloud
 from scenefuse.georef.placement import (
     MAX_GPS_OFF_M,
     MIN_GPS_PHOTOS,
-    UP,
     GeoreferenceSettings,
     GpsCameras,
     Placement,

@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, setting
-from scenefuse.core.transforms import SD_OVER_MEDIAN, Sim3, fit_sim3, fit_sim3_robust, rotation_between
+from scenefuse.core.transforms import SD_OVER_MEDIAN, UP, Sim3, fit_sim3, fit_sim3_robust, rotation_between
 from scenefuse.georef.control import MIN_CONTROL_POINTS, LocatedPoint, check_spread, describe_misses
 from scenefuse.photos.geodesy import MAX_MEDIAN_DISTANCES
 from scenefuse.sfm.gravity import MAX_VERTICAL_SD_DEG
 
 Array = NDArray[np.float64]
-UP = np.array([0.0, 0.0, 1.0])
 
 # Fewer registered photos with GPS do not show which of them is an outlier.
 MIN_GPS_PHOTOS = 5

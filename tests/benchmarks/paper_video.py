@@ -28,7 +28,6 @@ from scenefuse.metrics.true_cameras import Cameras, pinhole
 from scenefuse.nerf.prior.training import optimise, predict, prepare_torch
 from scenefuse.paper.estimate_as_paper import chained, trajectory_error
 from scenefuse.paper.monocular import (
-    MonocularSettings,
     frames_of,
     monocular_losses,
     new_monocular_networks,
@@ -96,7 +95,7 @@ def learned(views: Views, true: Array, diagonal: float, epochs: int, seed: int) 
     start = time.monotonic()
     device = prepare_torch(seed)
     frames, networks = frames_of(views, device), new_monocular_networks(device)
-    supervision, recipe = supervision_of(frames), recipe_of(MonocularSettings(epochs, WIDTH))
+    supervision, recipe = supervision_of(frames), recipe_of(epochs)
     objective = monocular_losses(networks, frames, supervision, recipe)
     with tempfile.TemporaryDirectory() as folder:
         optimise(networks.parts(), frames, objective, recipe, Path(folder) / "state.pt", seed)

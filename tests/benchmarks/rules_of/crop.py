@@ -110,7 +110,7 @@ def _clicks(name: str, rank: int) -> Path:
     pixels = view.visible(_own(name))[1]
     mask[pixels[:, 1], pixels[:, 0]] = 1
     closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
-    labels, at = clicks_on(closed > 0, PromptSettings(5, False, 1.0, 4.0), np.random.default_rng(0))
+    labels, at = clicks_on(closed > 0, PromptSettings(5, False, (1.0, 4.0)), np.random.default_rng(0))
     path = Path("results/bench/crop_clicks") / f"{name}_{rank}.tsv"
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = [f"{label}\t{view.name}\t{x:.1f}\t{y:.1f}" for label, (x, y) in zip(labels, at)]
