@@ -196,8 +196,8 @@ def finish_scenes():
     and metrics of before go: the page would show them as if they were of this run."""
     made = set()
     takes = {"complete_scene": failed_logs(), "draw_scene": ""}
-    for rule in (*takes, "compute_scene_metrics", "view_scene"):
-        for job in held_up(rule):
+    for step in (*takes, "compute_scene_metrics", "view_scene"):
+        for job in held_up(step):
             missing = [
                 other
                 for other in workflow.dag.dependencies[job]
@@ -205,10 +205,10 @@ def finish_scenes():
             ]
             objects = {other.wildcards.get("object") for other in missing}
             if None not in objects:
-                without = f" --failed {' '.join(sorted(objects))}{takes.get(rule, '')}"
-                if run_anyway(job, without if rule in takes and objects else ""):
+                without = f" --failed {' '.join(sorted(objects))}{takes.get(step, '')}"
+                if run_anyway(job, without if step in takes and objects else ""):
                     made.add(job)
-            elif rule != "complete_scene":
+            elif step != "complete_scene":
                 for output in job.output:
                     Path(output).unlink(missing_ok=True)
 
