@@ -81,7 +81,7 @@ def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSe
         StageError: nothing marks the object, the marks are wrong or contradict each other, or too few points are left.
     """
     scene = open_cloud(inputs.scene)
-    near, cut, marks = _cut(scene, inputs, settings)
+    near, cut, marks = crop_of(scene, inputs, settings)
     part = near[cut.keep]
     write_cloud(crop, part)
     unit = length_unit(inputs.georeference_json)
@@ -100,7 +100,7 @@ def _up_cue(georeference_json: Path | None) -> str | None:
     return None if cue is None else str(cue)
 
 
-def _cut(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:
+def crop_of(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:
     """The part of the scene that was read, and the crop of it by what marks the object, in this order: masks (or the
     object's own cloud) where photos are linked, then the user's file."""
     alignment = None if inputs.alignment_json is None else read_json(inputs.alignment_json)

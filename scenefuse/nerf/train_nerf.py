@@ -84,7 +84,7 @@ def train_nerf(
         report=photos_json,
         settings=build(UndistortSettings, wanted["undistort"]),
     )
-    chosen = _nerf_settings(wanted, options, epochs, value(read_json(photos_json), "masks_exact"))
+    chosen = nerf_settings(wanted, options, epochs, value(read_json(photos_json), "masks_exact"))
     train_object_nerf(
         inputs=NerfInputs(workspace, mattes),
         stage=out / "nerf",
@@ -113,7 +113,7 @@ def _clear(out: Path) -> None:
         (out / old).unlink(missing_ok=True)
 
 
-def _nerf_settings(wanted: dict[str, Any], options: TrainingOptions, epochs: int, exact: bool) -> NerfSettings:
+def nerf_settings(wanted: dict[str, Any], options: TrainingOptions, epochs: int, exact: bool) -> NerfSettings:
     """Settings and options together; where masks are exact, no band around their edges is left out."""
     built = build(NerfSettings, wanted["nerf"] | {"epochs": epochs})
     recipe = replace(options.recipe, mask_band_px=0) if exact else options.recipe

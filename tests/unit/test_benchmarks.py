@@ -28,7 +28,7 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in BENCHMARKS.glob("*.py")))
 def test_a_benchmark_can_be_imported_and_holds_the_function_of_its_name(name):
-    commands = {"rules": "run"}
+    commands = {"rules": "run", "faults": "stages"}
     assert callable(getattr(importlib.import_module(f"benchmarks.{name}"), commands.get(name, name)))
 
 

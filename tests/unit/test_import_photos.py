@@ -20,7 +20,7 @@ from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates
 from scenefuse.nerf.render import RenderedView
 from scenefuse.nerf.rendered_maps import RenderedMapSettings, measure_quality
-from scenefuse.nerf.train_nerf import TrainingOptions, _nerf_settings, train_nerf
+from scenefuse.nerf.train_nerf import TrainingOptions, nerf_settings, train_nerf
 from scenefuse.nerf.training import NerfRecipe
 from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
 from scenefuse.photos.views import load_views
@@ -421,7 +421,7 @@ def test_a_sphere_from_the_files_to_its_cloud_and_a_nerf_without_a_cloud(tmp_pat
 
 def test_exact_masks_have_no_band_that_is_left_out():
     wanted = read_settings(None)["object"]
-    assert [_nerf_settings(wanted, OPTIONS, 4, exact).recipe.mask_band_px for exact in (True, False)] == [0, 2]
+    assert [nerf_settings(wanted, OPTIONS, 4, exact).recipe.mask_band_px for exact in (True, False)] == [0, 2]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from scenefuse.core.checkpoints import load_checkpoint
 from scenefuse.core.project import read_project
 from scenefuse.core.settings import read_differences
 from scenefuse.core.stage import StageError
-from scenefuse.photos.cameras.metashape import _chunk
+from scenefuse.photos.cameras.metashape import read_metashape
 from scenefuse.photos.photos import list_photos
 
 
@@ -85,4 +85,4 @@ def test_xml_with_entities_is_not_parsed(tmp_path):
     entities = '<!DOCTYPE d [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]>'
     (tmp_path / "cameras.xml").write_text(f"{entities}<document><chunk>&b;</chunk></document>")
     with pytest.raises(ValueError, match="document type"):
-        _chunk(tmp_path / "cameras.xml")
+        read_metashape(tmp_path / "cameras.xml")

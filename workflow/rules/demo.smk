@@ -87,7 +87,7 @@ rule click_fiducials:
         mem_mb=2000,
         runtime=10,
     params:
-        options="--least-miss-px 0 --most-miss-px 2",
+        options="--miss-px 0 2",
         seed=config["seed"],
         script=script("demo/click_points.py"),
         code=code("demo/click_points.py"),

@@ -85,7 +85,7 @@ def _stage(scene: Path, folder: Path, marks: Path | None, settings: CropSettings
 
     def crop() -> Array:
         with redirect_stdout(StringIO()):
-            near, cut, _ = crop_scene._cut(crop_scene.open_cloud(inputs.scene), inputs, settings)
+            near, cut, _ = crop_scene.crop_of(crop_scene.open_cloud(inputs.scene), inputs, settings)
         return near.points[cut.keep]
 
     return crop
