@@ -4,7 +4,6 @@ import codecs
 import csv
 import io
 import re
-import unicodedata
 from pathlib import Path
 
 from scenefuse.core.stage import StageError
@@ -97,11 +96,6 @@ def comma_advice(cells: list[str]) -> str:
     """Advice for an error about cells that should be numbers, where one has a decimal comma; else ""."""
     odd = next((cell for cell in cells if DECIMAL_COMMA.fullmatch(cell)), None)
     return f"; {odd} has a decimal comma, write {odd.replace(',', '.')}" if odd else ""
-
-
-def composed(name: str) -> str:
-    """A photo's name in one spelling, to compare it: macOS writes an umlaut as two characters, others as one."""
-    return unicodedata.normalize("NFC", name)
 
 
 def read_text(path: Path) -> str:

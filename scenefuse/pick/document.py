@@ -4,12 +4,11 @@ import csv
 import hashlib
 import io
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.core.tables import composed, read_cells, read_text
-from scenefuse.marks.clicks import HEADERS, Click, Kind, ScenePoints, read_length_clicks, read_points
+from scenefuse.core.tables import read_cells, read_text
+from scenefuse.marks.clicks import HEADERS, Click, Kind, ScenePoints, in_photos, read_length_clicks, read_points
 from scenefuse.pick.edits import Rows, merged
 
 
@@ -25,9 +24,9 @@ class Document:
     """
 
     def __init__(self, path: Path, kind: Kind, photos: Iterable[str] = ()) -> None:
-        """Read the file; names of photos are spelled as in `photos`, where the file writes their umlauts otherwise."""
+        """Read the file; names of photos are spelled as in `photos`, where the file writes them otherwise."""
         self.path, self.kind = path, kind
-        self._spelled = {composed(name): name for name in photos}
+        self._photos = list(photos)
         self.version = 0
         self.read()
 
@@ -99,8 +98,7 @@ class Document:
         marked = read_length_clicks(self.path) if self.kind == "lengths" else read_points(self.path)
         if isinstance(marked, ScenePoints):
             raise StageError(f"{self.path} holds points by their coordinates, which are not clicked")
-        named = tuple(replace(row, photo=self._spelled.get(composed(row.photo), row.photo)) for row in marked.rows)
-        return marked.kind, named
+        return marked.kind, tuple(in_photos(marked.rows, self._photos, self.path))
 
     def _write(self, rows: Rows) -> None:
         lines = read_text(self.path).splitlines() if self.path.exists() else []
