@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.core.stage import atomic_file, value
-from scenefuse.core.transforms import Array, Sim3, rotation_between
+from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.report.page import document, figure, view_section
 from scenefuse.report.values import flatten, number
 from scenefuse.report.view import REMOVED, VIEW_POINTS, View, merge, thin, within
@@ -71,8 +71,7 @@ def write_page(
 
 def view_of(name: str, done: Completed, up: Array | None, unit: str) -> View:
     """The 3D view of the completed scene around what was added, before and after."""
-    upright = np.array([0.0, 0.0, 1.0])
-    level = Sim3(1.0, rotation_between(upright if up is None else up, upright), np.zeros(3))
+    level = Sim3(1.0, rotation_between(UP if up is None else up, UP), np.zeros(3))
     added = done.added if len(done.added) else done.before
     corners = np.percentile(added.points, [0.5, 99.5], axis=0)
     middle = np.floor(corners.mean(0))
