@@ -4,6 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from matplotlib import colormaps
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import Normalize
 from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud
@@ -12,9 +16,15 @@ from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array, box_corners
 from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.sheets import Image, add_axes, new_figure, save_png, to_image
-from scenefuse.photos.workspace import read_views
-from scenefuse.report.render import MAX_DRAWN, orbit_camera, point_radii, render
+from scenefuse.photos.workspace import View as PhotoView
+from scenefuse.photos.workspace import read_model, read_views
+from scenefuse.report.render import MAX_DRAWN, Camera, luminance, orbit_camera, point_radii, render
+from scenefuse.report.values import read_table
 from scenefuse.report.view import REMOVED, VIEW_POINTS, View, merge, thin, within, write_view
+
+PANEL_PX = (704, 520)
+# By the number of photos, from none to nine or more.
+OVERLAP_COLORS = colormaps["RdYlGn"].resampled(10)(range(10), bytes=True)[:, :3]
 
 
 def draw_scene(
@@ -22,16 +32,18 @@ def draw_scene(
     name: str,
     dense: Path,
     georeferenced: Path | None = None,
+    residuals: Path | None = None,
     objects: list[Path],
     failed: tuple[str, ...] = (),
     figure: Path,
 ) -> None:
-    """Draw a scene from above and obliquely with its camera positions and the boxes of its objects.
+    """Draw a scene from above and obliquely with its cameras and objects, the cameras' errors and their overlap.
 
     Args:
         name: the scene's name, for the title.
         dense: the scene's dense cloud.
         georeferenced: COLMAP model in the same frame; None where the scene was given as a cloud.
+        residuals: what is left at positions by GPS (residuals.tsv); None where the scene was given as a cloud.
         objects: result folders of the scene's objects; the bounding box of registration/full/crop.ply is drawn.
         failed: names of the objects that failed; they get no box.
         figure: output PNG, below 1 MB.
@@ -43,40 +55,97 @@ def draw_scene(
     every = max(1, -(-len(scene) // MAX_DRAWN))
     cloud = concatenate([part for _, part in scene.parts(every)])
     views = [] if georeferenced is None else read_views(georeferenced)
-    centres = np.array([view.centre for view in views]).reshape(-1, 3)
     shown = [folder for folder in objects if folder.name not in failed]
     crops = {f.name: read_cloud(f / "registration/full/crop.ply").points for f in shown}
     boxes = {name: box_corners(crop.min(0), crop.max(0)) for name, crop in crops.items()}
-    cameras = "given as a cloud, no cameras" if georeferenced is None else f"cameras (red): {len(centres)}"
     drawn = "" if every == 1 else f" (one in {every} is drawn)"
-    note = f"{len(scene):,} points{drawn}, {cameras}, objects (boxes): {len(boxes)}"
-    save_png(figure, _scene_sheet(name, note, cloud, centres, boxes))
+    note = f"{len(scene):,} points{drawn}, objects (boxes): {len(boxes)}, "
+    note += f"cameras (red): {len(views)}. {_calibration(georeferenced)}" if georeferenced else "given as a cloud"
+    errors = pd.DataFrame() if residuals is None else read_table(residuals)
+    save_png(figure, _scene_sheet(name, note, cloud, views, boxes, errors))
 
 
-def _scene_sheet(name: str, note: str, cloud: Cloud, centres: Array, boxes: dict[str, Array]) -> Image:
-    """The scene from above and obliquely; cameras at `centres` (N, 3), boxes of 8 corners."""
+def _calibration(model: Path) -> str:
+    """The lenses of a model in a line, as COLMAP names their parameters."""
+    lenses = []
+    for camera in read_model(model).cameras.values():
+        values = [f"{name.strip()} {number:.5g}" for name, number in zip(camera.params_info.split(","), camera.params)]
+        lenses.append(f"{camera.model.name}, {camera.width} × {camera.height}: {', '.join(values)}")
+    return f"Lens: {lenses[0]}" + (f", and {len(lenses) - 1} more" if lenses[1:] else "")
+
+
+def _scene_sheet(
+    name: str, note: str, cloud: Cloud, views: list[PhotoView], boxes: dict[str, Array], errors: pd.DataFrame
+) -> Image:
+    """The scene from above and obliquely, with boxes of 8 corners; where it has cameras, their errors and overlap."""
     radii = point_radii(cloud.points)
     ground = box_corners(*np.percentile(cloud.points, [1, 99], axis=0))
-    views = {
-        "from above": orbit_camera(ground, -90.0, 90.0, (640, 520), orthographic=True),
-        "oblique": orbit_camera(np.concatenate([ground, centres]), -60.0, 30.0, (760, 520)),
+    centres = np.array([view.centre for view in views]).reshape(-1, 3)
+    cameras = {
+        "from above": orbit_camera(ground, -90.0, 90.0, PANEL_PX, orthographic=True),
+        "oblique": orbit_camera(np.concatenate([ground, centres]), -60.0, 30.0, PANEL_PX),
     }
-    size = (640 + 760 + 24, 520 + 66)
+    (width, height), gap, top = PANEL_PX, 8, 60
+    size = (2 * (width + gap) + gap, top + (height + gap) * (2 if views else 1))
     sheet = new_figure(size)
-    sheet.text(8 / size[0], 1 - 10 / size[1], f"Scene {name}", fontsize=12, fontweight="bold", va="top")
-    sheet.text(8 / size[0], 1 - 32 / size[1], note, fontsize=9.5, color="#444444", va="top")
-    left = 8
-    for title, camera in views.items():
-        axes = add_axes(sheet, (left, 60, camera.width_px, camera.height_px), size)
-        axes.imshow(render(cloud, camera, radii))
-        axes.set(xlim=(0, camera.width_px), ylim=(camera.height_px, 0))
-        axes.text(8, 20, title, fontsize=10, bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none"})
-        x, y = camera.project(centres)[0].T
-        axes.scatter(x, y, s=14, c="#d6261f", edgecolors="white", linewidths=0.5, zorder=3)
+    sheet.text(gap / size[0], 1 - 10 / size[1], f"Scene {name}", fontsize=14, fontweight="bold", va="top")
+    sheet.text(gap / size[0], 1 - 34 / size[1], note, fontsize=9.5, color="#444444", va="top")
+
+    def panel(row: int, column: int, title: str, picture: Image) -> Any:
+        axes = add_axes(sheet, (gap + column * (width + gap), top + row * (height + gap), width, height), size)
+        axes.imshow(picture)
+        axes.set(xlim=(0, width), ylim=(height, 0))
+        axes.text(8, 22, title, fontsize=12, bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none"})
+        return axes
+
+    for column, (title, camera) in enumerate(cameras.items()):
+        axes = panel(0, column, title, render(cloud, camera, radii))
+        axes.scatter(*camera.project(centres)[0].T, s=14, c="#d6261f", edgecolors="white", linewidths=0.5, zorder=3)
         for label, corners in boxes.items():
             _draw_box(axes, camera.project(corners)[0], label)
-        left += camera.width_px + 8
+    if views:
+        camera, grey = cameras["from above"], np.repeat(luminance(cloud.colors)[:, None], 3, axis=1) * 0.4 + 150.0
+        axes = panel(1, 0, "camera positions: by photos less by GPS", render(cloud, camera, radii, grey))
+        _draw_errors(axes, camera, {view.name: view.centre for view in views}, errors)
+        counts = sum((_frames(view, cloud.points) for view in views), np.zeros(len(cloud), np.int64))
+        colors = OVERLAP_COLORS[np.minimum(counts, len(OVERLAP_COLORS) - 1)]
+        axes = panel(1, 1, "overlap: photos that frame a place", render(cloud, camera, radii, colors))
+        for number, color in enumerate(OVERLAP_COLORS):
+            label = f"{number}" + (" or more" if number == len(OVERLAP_COLORS) - 1 else "")
+            axes.plot([], [], "s", color=color / 255, label=label)
+        axes.legend(loc="lower center", ncols=len(OVERLAP_COLORS), fontsize=9, handletextpad=0, columnspacing=0.6)
     return to_image(sheet)
+
+
+def _frames(view: PhotoView, points: Array) -> NDArray[np.bool_]:
+    """(N,) whether a photo's frame holds points (N, 3), hidden ones too."""
+    pixels, depth = view.project(points)
+    return (depth > 0) & (pixels >= 0).all(1) & (pixels < [view.width, view.height]).all(1)
+
+
+def _draw_errors(axes: Any, camera: Camera, centres: dict[str, Array], errors: pd.DataFrame) -> None:
+    """An ellipse at each camera, its half axes the errors east and north, enlarged; its colour the error upwards."""
+    errors = errors[errors.kind == "position"].dropna(subset=["east_m", "north_m"]) if len(errors) else errors
+    errors = errors[errors.name.isin(centres)] if len(errors) else errors
+    if errors.empty:
+        axes.text(8, 46, "no positions by GPS to compare with", fontsize=10)
+        return
+    pixels = camera.project(np.array([centres[name] for name in errors.name]))[0]
+    sides = errors[["east_m", "north_m"]].abs().to_numpy()
+    # The median error is as large on the picture as a twentieth of its height, in a round factor.
+    factor = 0.05 * camera.height_px / camera.focal_px / max(float(np.median(np.linalg.norm(sides, axis=1))), 1e-9)
+    factor = float(f"{factor:.0e}")
+    limit = float(errors.up_m.abs().max()) or 1.0
+    shapes = EllipseCollection(
+        *(2 * factor * camera.focal_px * sides).T, np.zeros(len(errors)), units="xy", offsets=pixels,
+        offset_transform=axes.transData, cmap="coolwarm", norm=Normalize(-limit, limit), alpha=0.75, edgecolor="black",
+    )  # fmt: skip
+    shapes.set_array(errors.up_m.fillna(0.0).to_numpy())
+    axes.add_collection(shapes)
+    axes.scatter(*pixels.T, s=5, c="black", zorder=4)
+    scale = axes.figure.colorbar(shapes, cax=axes.inset_axes((0.7, 0.1, 0.27, 0.025)), orientation="horizontal")
+    scale.set_label("upwards (m)", fontsize=9)
+    axes.text(8, camera.height_px - 14, f"east and north enlarged {factor:,.0f} times", fontsize=10)
 
 
 def _draw_box(axes: Any, corners_px: Array, label: str) -> None:

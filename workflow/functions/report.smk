@@ -52,10 +52,14 @@ def what_is_given(row):
     return "both" if row.get("photos") else "cloud"
 
 
-def scene_model(wildcards):
-    """The cameras of a scene; none where it has no photos."""
-    folder = f"results/scenes/{wildcards.scene}/georeferenced"
-    return [folder] if scene_row(wildcards.scene).get("photos") else []
+def if_flown(name):
+    """Input function: a scene's file; none where the scene has no photos."""
+
+    def files(wildcards):
+        has_photos = scene_row(wildcards.scene).get("photos")
+        return [f"results/scenes/{wildcards.scene}/{name}"] if has_photos else []
+
+    return files
 
 
 def run_options(wildcards=None):

@@ -22,7 +22,8 @@ rule draw_scene:
     """The scene from above and from the side, with its cameras and objects."""
     input:
         cloud="results/scenes/{scene}/dense.ply",
-        georeferenced=scene_model,
+        georeferenced=if_flown("georeferenced"),
+        residuals=if_flown("residuals.tsv"),
         crops=of_objects("registration/full/crop.ply"),
     output:
         report(
@@ -41,7 +42,7 @@ rule draw_scene:
         runtime=by_size(30, cloud=0.002),
     params:
         objects=object_folders,
-        cameras=options_of("georeferenced"),
+        cameras=options_of("georeferenced", "residuals"),
         script=script("report/draw_scene.py"),
         code=code("report/draw_scene.py"),
     message:
