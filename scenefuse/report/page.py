@@ -65,7 +65,8 @@ def embedded(path: Path, alt: str) -> str:
 
 def figure(path: Path, caption: str) -> str:
     """A picture with its caption."""
-    return f"<figure>{embedded(path, caption)}<figcaption>{escape(caption)}</figcaption></figure>"
+    picture = embedded(path, caption)
+    return f'<figure class="sheet">{picture}<figcaption>{escape(caption)}</figcaption></figure>'
 
 
 def view_section(key: str, name: str, view: View) -> str:

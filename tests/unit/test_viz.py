@@ -11,6 +11,7 @@ from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.photos.pictures import write_depth
 from scenefuse.photos.sheets import save_png
+from scenefuse.photos.workspace import read_views
 from scenefuse.report.figures import FigureInputs, draw_lone_object, draw_object
 from scenefuse.report.page import view_section
 from scenefuse.report.render import Camera, orbit_camera, point_radii, render
@@ -358,3 +359,23 @@ def test_scene_figure_with_a_failed_object(capture, tmp_path):
     assert ((picture[..., 2] > 180) & (picture[..., 1] < 70)).sum() > 50
     with pytest.raises(StageError, match="failed/registration/full/crop.ply"):
         draw_scene(name="demo", **files, objects=objects, figure=figure)
+
+
+def test_the_scene_s_sheet_shows_the_errors_of_cameras_in_their_colour(capture, tmp_path):
+    model = capture / "undistorted/sparse"
+    names = [view.name for view in read_views(model)]
+    table = tmp_path / "residuals.tsv"
+
+    def blue(up_m):
+        rows = [f"position\t{name}\t1.0\t1.0\t{up_m if k else -9.0}" for k, name in enumerate(names)]
+        table.write_text("\n".join(["kind\tname\teast_m\tnorth_m\tup_m", *rows]))
+        draw_scene(
+            name="demo", dense=capture / "dense.ply", georeferenced=model, residuals=table, objects=[],
+            figure=tmp_path / "scene.png",
+        )  # fmt: skip
+        picture = cv2.imread(str(tmp_path / "scene.png")).astype(int)
+        errors = picture[picture.shape[0] // 2 :, : picture.shape[1] // 2]
+        return ((errors[..., 0] - errors[..., 2]) > 60).sum()
+
+    # All cameras too low (blue) but for the first, which sets the range of colours both times; then too high (red).
+    assert blue(-8.0) > 2 * blue(8.0) > 0
