@@ -24,7 +24,7 @@ from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.object_cloud import CloudSettings
-from scenefuse.nerf.prior.train_depth import DepthTrainingSettings
+from scenefuse.nerf.train_depth import DepthTrainingSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
 from scenefuse.paper.compare_with_paper import ComparisonSettings

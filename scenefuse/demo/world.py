@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
-from scenefuse.demo.meshes import Part, blob, box, grid, rotation, tube
-from scenefuse.demo.objects import OBJECTS
+from scenefuse.demo.objects import OBJECTS, Part, blob, box, grid, rotation, tube
 from scenefuse.demo.textures import Material, noise_at, path_distance
 
 # Height of the ground at east, north.

@@ -24,10 +24,9 @@ from scenefuse.core.stage import (
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.clicks import read_points
 from scenefuse.masks.algebra import kept_part, mask_folders
-from scenefuse.masks.prompted import Prompted, masks_from_prompts
 from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.sam2_weights import why_unavailable
-from scenefuse.masks.segmentation import MaskSettings, ScoredMasks, score_masks
+from scenefuse.masks.segmentation import MaskSettings, Prompted, ScoredMasks, masks_from_prompts, score_masks
 from scenefuse.masks.supplied import supplied_masks
 from scenefuse.masks.target import target_from_points
 from scenefuse.masks.votes import points_in_masks

@@ -13,9 +13,8 @@ from torch.nn.functional import avg_pool2d, conv2d, max_pool2d
 
 from scenefuse.nerf.field import Field
 from scenefuse.nerf.losses import COLOR_DELTA
-from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.rays import PhotoTensors, dilate
-from scenefuse.nerf.render import render_view
+from scenefuse.nerf.render import Occupancy, render_view
 
 # Colours of a place are compared in photos shrunk to at most this width: depths need not be exact to a pixel for it.
 SMALL_PX = 96

@@ -13,8 +13,8 @@ from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.consistency import normals_from_depth
 from scenefuse.nerf.appearance import MIN_OPACITY, falloff_map, fitted_log_gain, gains_nearby
-from scenefuse.nerf.prior.refine_depth import CONFIRMING_VIEWS, MAP_AGREEMENT, agreement
 from scenefuse.nerf.rays import PhotoTensors, dilate
+from scenefuse.nerf.refine_depth import CONFIRMING_VIEWS, MAP_AGREEMENT, agreement
 from scenefuse.nerf.render import RenderedView, render_view
 from scenefuse.nerf.training import Nerf
 from scenefuse.photos.pictures import write_depth, write_normals, write_picture

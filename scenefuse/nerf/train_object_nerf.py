@@ -18,11 +18,10 @@ from scenefuse.core.stage import StageError, atomic_directory, quantity, setting
 from scenefuse.core.transforms import Sim3
 from scenefuse.mvs.sparse_depths import own_points, sparse_depths
 from scenefuse.nerf.appearance import measured_sharpness, photo_weights
-from scenefuse.nerf.encoding import kernels_on
-from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf.field import FieldSettings, kernels_on
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.prior.refine_depth import DepthPrior, read_prior
 from scenefuse.nerf.rays import PhotoTensors
+from scenefuse.nerf.refine_depth import DepthPrior, read_prior
 from scenefuse.nerf.rendered_maps import (
     RenderedMaps,
     RenderedMapSettings,

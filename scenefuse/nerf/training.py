@@ -27,9 +27,8 @@ from scenefuse.nerf import losses
 from scenefuse.nerf.appearance import Appearance, find_appearance, squared_radius
 from scenefuse.nerf.field import Field, FieldSettings, coarse_to_fine
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.occupancy import Occupancy, updated
 from scenefuse.nerf.rays import PhotoTensors, PixelPool, RayBatch, camera_rays, draw_batch, pixel_pool
-from scenefuse.nerf.render import UNIFORM_SHARE, Composited, RayPrior, RaySamples, composite, march
+from scenefuse.nerf.render import UNIFORM_SHARE, Composited, Occupancy, RayPrior, RaySamples, composite, march, updated
 
 # Steps between updates of the grid (Mueller et al. 2022, appendix E.2).
 OCCUPANCY_EVERY = 16

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from scenefuse.core.stage import quantity
-from scenefuse.nerf.prior.inputs import DepthPhotos
-from scenefuse.nerf.prior.monodepth import inside, points_in_cam, project, sample
-from scenefuse.nerf.prior.refine_depth import MAP_AGREEMENT
-from scenefuse.nerf.prior.train_depth import residual_at_checks
+from scenefuse.nerf.monodepth import inside, points_in_cam, project, sample
+from scenefuse.nerf.prior_inputs import DepthPhotos
+from scenefuse.nerf.refine_depth import MAP_AGREEMENT
+from scenefuse.nerf.train_depth import residual_at_checks
 
 Content = dict[str, Any]
 

@@ -17,8 +17,7 @@ from torch.nn import functional
 from scenefuse.core.checkpoints import State
 from scenefuse.core.stage import StageError, quantity, setting
 from scenefuse.core.transforms import Array, rotation_angle_deg
-from scenefuse.nerf.prior.inputs import DepthPhotos
-from scenefuse.nerf.prior.monodepth import (
+from scenefuse.nerf.monodepth import (
     DepthNetwork,
     convolutions,
     depth_from_disparity,
@@ -26,7 +25,8 @@ from scenefuse.nerf.prior.monodepth import (
     masked_mean,
     smoothness,
 )
-from scenefuse.nerf.prior.training import Objective, PhotoScale, Recipe, huber, reprojection_error
+from scenefuse.nerf.prior_inputs import DepthPhotos
+from scenefuse.nerf.prior_training import Objective, PhotoScale, Recipe, huber, reprojection_error
 from scenefuse.photos.views import Views
 
 # What the depth network can say: an object that fits into its photos, about 1 away, is neither nearer nor farther.

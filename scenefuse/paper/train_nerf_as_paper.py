@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from scenefuse.core.stage import quantity, read_json, write_json
-from scenefuse.nerf.encoding import encode
-from scenefuse.nerf.field import Field, FieldSettings
+from scenefuse.nerf.field import Field, FieldSettings, encode
 from scenefuse.nerf.losses import DEPTH_DELTA, SOLID_OPACITY, LossWeights
-from scenefuse.nerf.prior.training import LEARNING_RATE, Recipe
+from scenefuse.nerf.prior_training import LEARNING_RATE, Recipe
 from scenefuse.nerf.rays import PhotoTensors, dilate
 from scenefuse.nerf.rendered_maps import DEPTH_JUMP
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, prepare_device, train_stage

@@ -94,8 +94,7 @@ class Segmenter:
                     return
                 except (StageError, UnavailableError, OSError) as error:
                     self.trouble = f"Masks are shown by GrabCut, not by SAM 2: {error}"
-            from scenefuse.masks.prompted import PROPAGATION_WIDTHS
-            from scenefuse.masks.segmentation import MaskSettings
+            from scenefuse.masks.segmentation import PROPAGATION_WIDTHS, MaskSettings
 
             width = PROPAGATION_WIDTHS * MaskSettings().grabcut_width_px
             self._ask, self.method = partial(query_grabcut, width), "GrabCut"

@@ -20,7 +20,7 @@ from scenefuse.core.transforms import Array
 from scenefuse.demo.clicks import PromptSettings, clicks_on, random_misses
 from scenefuse.geometry.visual_hull import Mask, mask_iou
 from scenefuse.marks.clicks import Click, Clicks
-from scenefuse.masks import prompted
+from scenefuse.masks import segmentation
 from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.segmentation import MaskSettings, score_masks
 from scenefuse.masks.supplied import supplied_masks
@@ -108,8 +108,8 @@ def clicked_masks(
         network = Remembering(load_network(Path(settings.sam2_encoder), Path(settings.sam2_decoder), None, 1)[0])
     names = sorted(thing.truth)
     rows, how = [], PromptSettings(inside=3 if box else 5, box=box)
-    with_stereo_points = cache(partial(prompted.with_stereo_points, thing.photos))
-    with patch.object(prompted, "with_stereo_points", lambda _: with_stereo_points()):
+    with_stereo_points = cache(partial(segmentation.with_stereo_points, thing.photos))
+    with patch.object(segmentation, "with_stereo_points", lambda _: with_stereo_points()):
         for name in [names[k] for k in np.linspace(0, len(names) - 1, photos).round().astype(int)]:
             for trial in range(clicks):
                 rows.append(_trial(thing, name, trial, how, part, network, settings))
@@ -165,7 +165,7 @@ def _trial(
     marked = Clicks(Path(name), "labels", tuple(Click(label, name, *pixel) for label, pixel in zip(labels, pixels)))
     row: dict[str, Any] = {"photo": name, "trial": trial}
     try:
-        found = prompted.masks_from_prompts(
+        found = segmentation.masks_from_prompts(
             marked, thing.folder / "sparse", thing.sizes, thing.photos, thing.up, network, settings, 0
         )
         scored = score_masks(found.masks, found.target, thing.photos.views, settings, found.clicked)

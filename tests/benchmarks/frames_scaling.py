@@ -24,20 +24,20 @@ from scenefuse.demo.capture import OrbitSettings, render_object
 from scenefuse.metrics.true_cameras import Cameras, read_cameras, visible
 from scenefuse.metrics.truth import read_mesh, sample_surface
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
-from scenefuse.nerf.prior.refine_depth import refine_depth
-from scenefuse.nerf.prior.train_depth import DepthTrainingSettings, train_depth
+from scenefuse.nerf.refine_depth import refine_depth
+from scenefuse.nerf.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 
 # A quarter of stage 1's pixels: what counts is how the cost grows with the photos.
 SMALL_PX = 72
 # Functions of a stage whose share is listed by itself: module, function -> part.
 PARTS = {
-    ("scenefuse.nerf.prior.train_depth", "load_views"): "loading",
-    ("scenefuse.nerf.prior.train_depth", "network_inputs"): "stereo",
-    ("scenefuse.nerf.prior.train_depth", "train_network"): "training",
-    ("scenefuse.nerf.prior.train_depth", "confirm"): "refinement",
-    ("scenefuse.nerf.prior.refine_depth", "load_views"): "loading",
-    ("scenefuse.nerf.prior.refine_depth", "confirm"): "refinement",
+    ("scenefuse.nerf.train_depth", "load_views"): "loading",
+    ("scenefuse.nerf.train_depth", "network_inputs"): "stereo",
+    ("scenefuse.nerf.train_depth", "train_network"): "training",
+    ("scenefuse.nerf.train_depth", "confirm"): "refinement",
+    ("scenefuse.nerf.refine_depth", "load_views"): "loading",
+    ("scenefuse.nerf.refine_depth", "confirm"): "refinement",
     ("scenefuse.nerf.train_object_nerf", "load_views"): "loading",
     ("scenefuse.nerf.train_object_nerf", "read_prior"): "prior",
     ("scenefuse.nerf.train_object_nerf", "find_volume"): "visual hull",

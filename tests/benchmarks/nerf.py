@@ -21,12 +21,10 @@ from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import run
 from scenefuse.geometry.matcher import Matcher
 from scenefuse.mvs.plane_sweep import DepthMapSettings
-from scenefuse.nerf import encoding, kernels
-from scenefuse.nerf.encoding import encode, encode_reference, hash_grid, kernels_on
-from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf import field, kernels
+from scenefuse.nerf.field import FieldSettings, encode, encode_reference, hash_grid, kernels_on
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.occupancy import Occupancy
-from scenefuse.nerf.render import UNIFORM_SHARE, march, no_prior
+from scenefuse.nerf.render import UNIFORM_SHARE, Occupancy, march, no_prior
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, keep_memory, new_nerf, train
 from scenefuse.photos.workspace import View
 
@@ -62,10 +60,10 @@ def by_both(measured: Callable[[], float]) -> dict[str, Callable[[], float]]:
     """The same with the kernels and in plain PyTorch."""
 
     def plain() -> float:
-        before = kernels.AVAILABLE, encoding.triton_kernels
-        kernels.AVAILABLE, encoding.triton_kernels = False, None
+        before = kernels.AVAILABLE, field.triton_kernels
+        kernels.AVAILABLE, field.triton_kernels = False, None
         taken = measured()
-        kernels.AVAILABLE, encoding.triton_kernels = before
+        kernels.AVAILABLE, field.triton_kernels = before
         return taken
 
     return {"scenefuse": measured, "scenefuse in plain PyTorch": plain}

@@ -25,7 +25,7 @@ from scenefuse.demo import bodies, textures
 from scenefuse.demo.capture import render
 from scenefuse.demo.world import World, build_world, openness
 from scenefuse.metrics.true_cameras import Cameras, pinhole
-from scenefuse.nerf.prior.training import optimise, predict, prepare_torch
+from scenefuse.nerf.prior_training import optimise, predict, prepare_torch
 from scenefuse.paper.estimate_as_paper import chained, trajectory_error
 from scenefuse.paper.monocular import (
     frames_of,

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.planted import SHAPES
 
 from scenefuse.core.transforms import Array, Sim3, look_at
-from scenefuse.demo.meshes import Part, box, grid, join
+from scenefuse.demo.objects import Part, box, grid, join
 
 Kind = Literal["grid", "orbit", "row"]
 Rows = NDArray[np.int64]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3, rotation_angle_deg, rotation_between
 from scenefuse.demo import objects
-from scenefuse.demo.meshes import Part, blob, box, grid, join, lathe, tube
+from scenefuse.demo.objects import Part, blob, box, grid, join, lathe, tube
 from scenefuse.geometry.depth_test import FreeSpace, without_edges
 from scenefuse.photos.workspace import View
 

@@ -12,9 +12,8 @@ import torch
 from support.textured_plane import plane_views, speckled
 
 from scenefuse.core.stage import StageError
-from scenefuse.nerf.prior import train_depth as stage
-from scenefuse.nerf.prior.inputs import depth_photos, network_inputs
-from scenefuse.nerf.prior.monodepth import (
+from scenefuse.nerf import train_depth as stage
+from scenefuse.nerf.monodepth import (
     DepthNetwork,
     depth_from_disparity,
     disparity_from_depth,
@@ -25,8 +24,9 @@ from scenefuse.nerf.prior.monodepth import (
     ssim,
     warp,
 )
-from scenefuse.nerf.prior.train_depth import align_to_points
-from scenefuse.nerf.prior.training import Recipe, predict, train_network
+from scenefuse.nerf.prior_inputs import depth_photos, network_inputs
+from scenefuse.nerf.prior_training import Recipe, predict, train_network
+from scenefuse.nerf.train_depth import align_to_points
 from scenefuse.paper.monocular import rigid
 from scenefuse.photos.pictures import read_depth
 

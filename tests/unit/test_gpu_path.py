@@ -11,10 +11,10 @@ from support.sideways_video import sideways_video
 from support.textured_plane import plane_views
 
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
-from scenefuse.nerf import encoding
+from scenefuse.nerf import field
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.prior.training import Recipe, optimise, predict
+from scenefuse.nerf.prior_training import Recipe, optimise, predict
 from scenefuse.nerf.render import render_view
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
 from scenefuse.paper.monocular import frames_of, monocular_losses, new_monocular_networks, supervision_of
@@ -27,7 +27,7 @@ def gpu(monkeypatch):
     if torch.cuda.is_available():
         yield
         return
-    monkeypatch.setattr(encoding, "triton_kernels", None)
+    monkeypatch.setattr(field, "triton_kernels", None)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.nn.Module, "to", to_pretended)
     with PretendGpu():

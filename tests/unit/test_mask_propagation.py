@@ -12,11 +12,16 @@ from scenefuse.core.stage import StageError
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.marks.clicks import Click, Clicks
 from scenefuse.masks.grabcut import along_edges, grow_seeds, query_grabcut
-from scenefuse.masks.prompted import masks_from_prompts
 from scenefuse.masks.prompts import NO_PIXELS, Prompts, far_apart
 from scenefuse.masks.propagation import NO_CLICKS, best_mask, one_photo, propagate
 from scenefuse.masks.sam2 import query_sam2
-from scenefuse.masks.segmentation import MaskSettings, score_masks, segment_again, segment_by_grabcut
+from scenefuse.masks.segmentation import (
+    MaskSettings,
+    masks_from_prompts,
+    score_masks,
+    segment_again,
+    segment_by_grabcut,
+)
 from scenefuse.masks.target import target_from_votes
 from scenefuse.masks.votes import Voter, known_pixels, known_points, voter_of
 from scenefuse.photos.workspace import Workspace, write_model
@@ -358,7 +363,7 @@ def test_clicks_and_box_prompt_their_own_photo_again_with_sam2(photos):
 
 def test_a_part_without_a_prompt_is_left_out_of_the_last_masks_too(tmp_path, photos, monkeypatch):
     # Stereo takes most of the time, and a ball of one colour gets no points by it.
-    monkeypatch.setattr("scenefuse.masks.prompted.with_stereo_points", lambda photos: photos)
+    monkeypatch.setattr("scenefuse.masks.segmentation.with_stereo_points", lambda photos: photos)
     monkeypatch.setattr("scenefuse.masks.segmentation.MIN_SHARE_OF_MEDIAN", 2)
     write_model(tmp_path, photos.views)
     network = BallNetwork(photos)

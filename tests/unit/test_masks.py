@@ -22,7 +22,6 @@ from scenefuse.masks import make_masks as masks_module
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.grabcut import cleaned, second_trimap, stamp
 from scenefuse.masks.make_masks import MaskInputs, make_masks
-from scenefuse.masks.prompted import masks_from_prompts
 from scenefuse.masks.sam2 import Sam2Transformers, check_weights, segment
 from scenefuse.masks.sam2_weights import (
     PACKAGE,
@@ -31,7 +30,7 @@ from scenefuse.masks.sam2_weights import (
     fetch_sam2_weights,
     why_unavailable,
 )
-from scenefuse.masks.segmentation import MaskSettings, score_masks
+from scenefuse.masks.segmentation import MaskSettings, masks_from_prompts, score_masks
 from scenefuse.masks.target import find_ground, target_from_points, upright_box
 from scenefuse.photos.pictures import read_rgb
 from scenefuse.photos.workspace import View, Workspace, read_model, read_workspace
@@ -350,7 +349,9 @@ def test_of_points_in_several_photos_the_exact_ones_prompt_sam2(capture, monkeyp
     pixels[np.array(marked.labels) == "top"] += np.random.default_rng(0).normal(0, 1.0, (4, 2))
     rows = tuple(dataclasses.replace(c, x_px=x, y_px=y) for c, (x, y) in zip(marked.rows, pixels))
     targets = []
-    monkeypatch.setattr("scenefuse.masks.prompted.segment_by_sam2", lambda network, target, *_: targets.append(target))
+    monkeypatch.setattr(
+        "scenefuse.masks.segmentation.segment_by_sam2", lambda network, target, *_: targets.append(target)
+    )
     photos, settings = read_workspace(capture / "undistorted"), dataclasses.replace(SETTINGS, max_click_residual_px=0.2)
     prompted = masks_from_prompts(
         dataclasses.replace(marked, rows=rows), capture / "undistorted/sparse", {}, photos,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from scenefuse.nerf import encoding, kernels
-from scenefuse.nerf.encoding import encode, encode_reference, hash_grid, spherical_harmonics
+from scenefuse.nerf import field, kernels
+from scenefuse.nerf.field import encode, encode_reference, hash_grid, spherical_harmonics
 
 
 @pytest.fixture(params=["numba", "triton"])
@@ -22,7 +22,7 @@ def device(request, monkeypatch):
     pytest.importorskip("triton", reason="Triton is not installed: pip install -r tests/requirements.txt")
     if torch.cuda.is_available():
         return "cuda"
-    monkeypatch.setattr(encoding, "kernel_module", lambda _: (encoding.triton_kernels, torch.Tensor.detach))
+    monkeypatch.setattr(field, "kernel_module", lambda _: (field.triton_kernels, torch.Tensor.detach))
     return "cpu"
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from scenefuse.nerf import kernels
-from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.render import (
+    Occupancy,
     RayPrior,
     composite,
     march,

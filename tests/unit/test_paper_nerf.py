@@ -10,8 +10,7 @@ from support.painted_sphere import photos_of, sphere_views, sphere_volume
 
 import scenefuse.nerf.training as training_module
 from scenefuse.core.machine import use_threads
-from scenefuse.nerf.encoding import encode
-from scenefuse.nerf.field import Field, FieldSettings
+from scenefuse.nerf.field import Field, FieldSettings, encode
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.rays import draw_batch
 from scenefuse.nerf.training import Nerf, NerfRecipe, Schedule, Training, new_nerf, train

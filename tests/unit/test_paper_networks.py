@@ -8,7 +8,7 @@ import torch
 from support.textured_plane import plane_views
 
 from scenefuse.core.stage import StageError, value
-from scenefuse.nerf.prior.inputs import depth_photos
+from scenefuse.nerf.prior_inputs import depth_photos
 from scenefuse.paper.fused_depth import fuse_by_inverse_variance, variance_between_views
 from scenefuse.paper.monocular import PoseNetwork, load_networks, pose_quantities, rigid
 

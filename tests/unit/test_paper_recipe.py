@@ -14,20 +14,22 @@ from support.textured_plane import plane_views
 from scenefuse.core.settings import ROOT, read_settings
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Sim3, rotation_between
+from scenefuse.nerf import prior_training as training
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.prior import training
-from scenefuse.nerf.prior.training import Recipe, optimise, predict
+from scenefuse.nerf.prior_training import Recipe, optimise, predict
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import NerfRecipe, Schedule
 from scenefuse.paper import train_nerf_as_paper as nerf_stage
 from scenefuse.paper.estimate_as_paper import (
+    EarlierStages,
     StageOutputs,
     chained,
     estimate_as_paper,
     few_frames,
     place,
     place_chain,
+    refine_as_paper,
     trajectory_error,
 )
 from scenefuse.paper.monocular import (
@@ -41,7 +43,6 @@ from scenefuse.paper.monocular import (
     small_photos,
     supervision_of,
 )
-from scenefuse.paper.refine_as_paper import EarlierStages, refine_as_paper
 from scenefuse.paper.train_nerf_as_paper import RANK_WEIGHT, as_paper, train_nerf_as_paper
 from scenefuse.photos.workspace import View, read_workspace
 from scenefuse.sfm import colmap, matches

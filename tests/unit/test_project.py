@@ -131,15 +131,15 @@ def test_a_test_uses_public_names_and_no_other_test_file(path):
 
 def test_private_uses_are_found():
     source = """
-from scenefuse.nerf import encoding
+from scenefuse.nerf import field
 from scenefuse.cloud.clouds import _spacing
 from scenefuse.photos import views as photos
 import scenefuse.core.stage
 from test_depth import plane
-encoding._encode(photos._matte, scenefuse.core.stage._run)
-monkeypatch.setattr(encoding, "_encode", None)
+field._encode(photos._matte, scenefuse.core.stage._run)
+monkeypatch.setattr(field, "_encode", None)
 patch.setattr("scenefuse.core.stage._run", None)
-encoding.encode(photos.__name__, mine._own)
+field.encode(photos.__name__, mine._own)
 """
     found = ["_encode", "_encode", "_matte", "_run", "_run", "_spacing", "test_depth"]
     assert sorted(private_uses(ast.parse(source))) == found

@@ -10,7 +10,7 @@ from support.planted import errors
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
-from scenefuse.demo.meshes import box, join, sheet
+from scenefuse.demo.objects import box, join, sheet
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import prepare
 from scenefuse.register.decision import FineSettings

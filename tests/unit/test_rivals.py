@@ -10,7 +10,7 @@ from support.planted import errors
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
-from scenefuse.demo.meshes import box, join, sheet
+from scenefuse.demo.objects import box, join, sheet
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, estimates, prior

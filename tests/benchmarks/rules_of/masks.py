@@ -20,11 +20,10 @@ from rules import Rule
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.geometry.visual_hull import Mask, mask_iou
 from scenefuse.marks.clicks import Clicks, read_points
-from scenefuse.masks.prompted import masks_from_prompts
 from scenefuse.masks.prompts import NO_PIXELS
 from scenefuse.masks.sam2 import Sam2Onnx
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
-from scenefuse.masks.segmentation import MaskSettings, score_masks
+from scenefuse.masks.segmentation import MaskSettings, masks_from_prompts, score_masks
 from scenefuse.masks.supplied import supplied_masks
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.workspace import Workspace, read_workspace
@@ -146,7 +145,7 @@ RULES = [
     Rule("no votes next to the outline", f"{M}.votes.POINT_RADIUS_SHARE", lambda _: 0.0),
     Rule("enclosed points are unknown", f"{M}.votes.MIN_OBJECT_POINTS", _never),
     Rule("a click outside counts in all photos", f"{M}.votes._denied", lambda _: lambda *__: []),
-    Rule("points by stereo", f"{M}.prompted.with_stereo_points", lambda _: lambda photos: photos),
+    Rule("points by stereo", f"{M}.segmentation.with_stereo_points", lambda _: lambda photos: photos),
     Rule("four prompts in the middle", f"{M}.sam2.MIDDLE_POINTS", lambda _: 1),
     Rule("prompts outside near only", f"{M}.sam2.MAX_OUTSIDE_DISTANCE_SHARE", _never),
     Rule("the largest of several clicks' masks", f"{M}.propagation.SCORE_MARGIN", lambda _: 1e-9),
@@ -154,7 +153,7 @@ RULES = [
     Rule("clicked parts prompt alone", f"{M}.propagation._with_clicked_parts", _mask_as_it_is(2)),
     Rule("parts of a mask that nothing prompts", f"{M}.propagation.prompted_parts", _mask_as_it_is(0)),
     Rule("contradicted masks once more", f"{M}.propagation.agrees_with_others", lambda _: lambda *__: True),
-    Rule("parts of a last mask", f"{M}.prompted._own_parts", _mask_as_it_is(0)),
+    Rule("parts of a last mask", f"{M}.segmentation._own_parts", _mask_as_it_is(0)),
     Rule("SAM 2 again by the hull", f"{M}.segmentation.MIN_SHARE_OF_MEDIAN", lambda _: 0.0),
     Rule("outlines move to edges", f"{M}.segmentation.along_edges", _mask_as_it_is(1)),
     Rule("gaps by their colours", f"{M}.grabcut.PINHOLE_SHARE", _never),
@@ -162,5 +161,5 @@ RULES = [
     Rule("seeds grow along even colours", f"{M}.grabcut.grow_seeds", lambda _: lambda *__: None),
     Rule("close prompts enclose a part", f"{M}.target.MAX_PART_EDGE_SHARE", lambda _: 0.0),
     Rule("clicked specks stay", f"{M}.grabcut.prompted_parts", lambda _: lambda mask, *__: mask & False),
-    Rule("clicks on a point may miss by 3 %", f"{M}.prompted.MAX_MISS_SHARE", lambda _: 0.0),
+    Rule("clicks on a point may miss by 3 %", f"{M}.segmentation.MAX_MISS_SHARE", lambda _: 0.0),
 ]

@@ -20,8 +20,7 @@ from scenefuse.core.checkpoints import (
 )
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, threads
-from scenefuse.nerf.prior.inputs import DepthPhotos, NetworkInputs
-from scenefuse.nerf.prior.monodepth import (
+from scenefuse.nerf.monodepth import (
     DepthNetwork,
     depth_from_disparity,
     masked_mean,
@@ -31,6 +30,7 @@ from scenefuse.nerf.prior.monodepth import (
     smoothness,
     warp,
 )
+from scenefuse.nerf.prior_inputs import DepthPhotos, NetworkInputs
 
 # Highest rate of Adam. Gradients are clipped, since single photos can be off by much.
 LEARNING_RATE = 1e-3

@@ -18,10 +18,10 @@ from scenefuse.core.checkpoints import key_of
 from scenefuse.core.stage import atomic_directory, quantity, setting, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.nerf.prior.inputs import STEREO, DepthPhotos, NetworkInputs, crop_to_object, depth_photos, network_inputs
-from scenefuse.nerf.prior.monodepth import DepthNetwork, depth_from_disparity, parameters, sample
-from scenefuse.nerf.prior.refine_depth import MAP_AGREEMENT, confirm, write_prior
-from scenefuse.nerf.prior.training import Recipe, loss_quantities, predict, prepare_torch, train_network
+from scenefuse.nerf.monodepth import DepthNetwork, depth_from_disparity, parameters, sample
+from scenefuse.nerf.prior_inputs import STEREO, DepthPhotos, NetworkInputs, crop_to_object, depth_photos, network_inputs
+from scenefuse.nerf.prior_training import Recipe, loss_quantities, predict, prepare_torch, train_network
+from scenefuse.nerf.refine_depth import MAP_AGREEMENT, confirm, write_prior
 from scenefuse.photos.views import load_views
 
 # Points that fix the scale and shift of a map.

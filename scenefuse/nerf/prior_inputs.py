@@ -16,7 +16,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.sparse_depths import beside_mask, own_points
 from scenefuse.mvs.view_selection import pair_worth
-from scenefuse.nerf.prior.monodepth import disparity_from_depth, points_in_cam
+from scenefuse.nerf.monodepth import disparity_from_depth, points_in_cam
 from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import View
 
