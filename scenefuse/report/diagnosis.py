@@ -35,8 +35,8 @@ def _split(fields: Fields) -> Iterator[str]:
         if apart:
             lost -= set(apart)
             yield (
-                f"photos joined among themselves, but not with the others ({len(apart)}): {named(apart)}; photograph"
-                " what lies between both groups, neighbours sharing two thirds of what they show"
+                f"photos that form a model of their own, not linked to the rest ({len(apart)}): {named(apart)};"
+                " photograph what lies between both groups, neighbours sharing two thirds of what they show"
             )
     if lost:
         yield (
@@ -61,7 +61,7 @@ def _one_side(fields: Fields) -> Iterator[str]:
     gap, between = find(fields, "undistorted.largest_gap_deg"), find(fields, "undistorted.gap_between")
     if gap is not None and gap > MAX_GAP_DEG:
         yield (
-            f"no photo looks at it from within {gap:.0f} degrees, between {between[0]} and {between[1]}: what can only"
+            f"{gap:.0f} degrees without a photo, between {between[0]} and {between[1]}: what can only"
             " be seen from there is missing; photograph it from there, if one can stand there"
         )
 

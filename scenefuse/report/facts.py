@@ -68,7 +68,7 @@ def object_facts(row: Row) -> dict[str, str]:
         )
     if "added_points" in has:
         facts["Points"] = f"{has['added_points']:,.0f} added" + (
-            f", {has['removed_points']:,.0f} of the scene replaced" if has.get("removed_points") else ""
+            f", {has['removed_points']:,.0f} of the scene removed" if has.get("removed_points") else ""
         )
         if "measured_share" in has:
             facts["Points"] += f"; {percent(has['measured_share'])} of the object's are confirmed by photos"
@@ -102,7 +102,9 @@ def _next(has: dict[str, Any]) -> dict[str, str]:
             else ""
         )
         places = "place" if has["stations"] == 1 else "places"
-        parts.append(f"photograph it from {has['stations']:.0f} {places} ({has['object']}/next_photos.csv){shows}")
+        parts.append(
+            f"photograph it from {has['stations']:.0f} {places} (objects/{has['object']}/next_photos.csv){shows}"
+        )
     if "advice" in has:
         parts.append(has["advice"])
     return {"Next": "; ".join(parts)} if parts else {}

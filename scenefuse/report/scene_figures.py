@@ -18,7 +18,7 @@ from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.sheets import Image, add_axes, new_figure, save_png, to_image
 from scenefuse.photos.workspace import View as PhotoView
 from scenefuse.photos.workspace import read_model, read_views
-from scenefuse.report.render import MAX_DRAWN, Camera, luminance, orbit_camera, point_radii, render
+from scenefuse.report.render import MAX_DRAWN, Camera, orbit_camera, point_radii, render
 from scenefuse.report.values import read_table
 from scenefuse.report.view import REMOVED, VIEW_POINTS, View, merge, thin, within, write_view
 
@@ -104,8 +104,8 @@ def _scene_sheet(
         for label, corners in boxes.items():
             _draw_box(axes, camera.project(corners)[0], label)
     if views:
-        camera, grey = cameras["from above"], np.repeat(luminance(cloud.colors)[:, None], 3, axis=1) * 0.4 + 150.0
-        axes = panel(1, 0, "camera positions: by photos less by GPS", render(cloud, camera, radii, grey))
+        camera = cameras["from above"]
+        axes = panel(1, 0, "camera positions: by photos less by GPS", render(cloud, camera, radii, (215, 215, 215)))
         _draw_errors(axes, camera, {view.name: view.centre for view in views}, errors)
         counts = sum((_frames(view, cloud.points) for view in views), np.zeros(len(cloud), np.int64))
         colors = OVERLAP_COLORS[np.minimum(counts, len(OVERLAP_COLORS) - 1)]
@@ -135,10 +135,10 @@ def _draw_errors(axes: Any, camera: Camera, centres: dict[str, Array], errors: p
     # The median error is as large on the picture as a twentieth of its height, in a round factor.
     factor = 0.05 * camera.height_px / camera.focal_px / max(float(np.median(np.linalg.norm(sides, axis=1))), 1e-9)
     factor = float(f"{factor:.0e}")
-    limit = float(errors.up_m.abs().max()) or 1.0
+    limit, widths = float(errors.up_m.abs().max()) or 1.0, 2 * factor * camera.focal_px * sides
     shapes = EllipseCollection(
-        *(2 * factor * camera.focal_px * sides).T, np.zeros(len(errors)), units="xy", offsets=pixels,
-        offset_transform=axes.transData, cmap="coolwarm", norm=Normalize(-limit, limit), alpha=0.75, edgecolor="black",
+        widths[:, 0], widths[:, 1], np.zeros(len(errors)), units="xy", offsets=pixels, offset_transform=axes.transData,
+        cmap="coolwarm", norm=Normalize(-limit, limit), alpha=0.75, edgecolor="black",
     )  # fmt: skip
     shapes.set_array(errors.up_m.fillna(0.0).to_numpy())
     axes.add_collection(shapes)

@@ -44,7 +44,7 @@ def test_nothing_is_said_where_all_is_well_or_nothing_has_run():
             ["not with the others (1): y.jpg", "placed (1): x.jpg"],
         ),
         ({"sparse__doubtful_photos": {"b.jpg": 0.6, "a.jpg": 0.7}}, ["in wrong places (2): a.jpg, b.jpg"]),
-        ({"undistorted__largest_gap_deg": 190.0}, ["within 190 degrees, between a.jpg and b.jpg"]),
+        ({"undistorted__largest_gap_deg": 190.0}, ["190 degrees without a photo, between a.jpg and b.jpg"]),
         ({"masks__photos_left_out": [f"{k}.jpg" for k in range(9)]}, ["9 of 40 masks", "and 4 more"]),
         (
             {"masks__clicks_left_out": ["the click at (3, 4) of a.jpg is 9 px off"]},

@@ -185,7 +185,7 @@ def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results)
     assert "dense.fallback: CPU used" in text
     assert "0.4 -> 0.9" in text
     words = " ".join(text.split())
-    assert "30 added, 16 of the scene replaced" in words and "of the object unconfirmed 7" in words
+    assert "30 added, 16 of the scene removed" in words and "of the object unconfirmed 7" in words
     away = "photos see a surface behind it: 4 points, the object measured it better: 12 points"
     assert f"taken away {away}" in words
     assert "fusion.notes: judged by the scene's photos" in words and "evidence.notes" not in words
@@ -464,7 +464,7 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
         "11.4 m × 9.96 m, 8.10 m high",
         "98.2 % is there, 1.8 % is missing: 1.0 % seen by no photo, 0.8 % where photos disagree",
         "Standard deviation of a point 7.20 mm on the object and 13.1 mm in the scene",
-        "Photograph it from 3 places (house/next_photos.csv): this would show 77 % of what photos can still show",
+        "Photograph it from 3 places (objects/house/next_photos.csv): this would show 77 % of what photos",
     ):
         assert sentence in " ".join(text.split()) and sentence in card, sentence
     assert "Not added to the scene: weak. Perhaps it is not in this scene" in text
@@ -509,7 +509,7 @@ def test_a_run_ends_in_three_lines(results):
     write_json(results / "objects/house/missing.json", {"stations": quantity(1, "")})
     result, page, following = closing_lines(summarise(results, ["house"])).splitlines()
     assert result.startswith("Result: 1 of 1 objects completed; ") and result.endswith("scenes/demo/completed.ply")
-    assert following == "Next:   house: Photograph it from 1 place (house/next_photos.csv)"
+    assert following == "Next:   house: Photograph it from 1 place (objects/house/next_photos.csv)"
 
 
 def test_shares_and_lengths_are_written_as_people_do():
