@@ -4,14 +4,17 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from scenefuse.core.stage import OUT_OF_MEMORY
+from scenefuse.core.stage import LACK_OF_MEMORY, OUT_OF_MEMORY
 
 ERROR = re.compile(r"\s*(error:|[\w.]*(Error|Exception)\b)")
-# What Python and the libraries say when memory cannot be had, also while they are loaded.
-LACK_OF_MEMORY = re.compile(
-    "^MemoryError|bad_alloc|[Cc]annot allocate memory|can't allocate memory|failed to map segment|ould not load.*llvm"
+KILLED = (
+    "its job was killed without a message, by kill -9 or because memory ran out; end other programs or raise the"
+    " memory limit, and run again to go on"
 )
-KILLED = "its job ended without a message: perhaps killed (out of memory?); see the log"
+NOT_ACCEPTED = "its job ended well, but Snakemake refused its outputs for the reason printed above"
+NO_LOG = (
+    "its job left no log: the machine that ran it may not see this folder or this environment; see the scheduler's log"
+)
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,19 @@ def why_unfinished(jobs: JobRecords, *names: str) -> str:
     return ""
 
 
+def why_ended(log: Path, benchmark: Path, started: float) -> str:
+    """Why a job of this run failed, whatever earlier runs left.
+
+    Args:
+        log: of the job.
+        benchmark: of the job.
+        started: time of the file system when the run began, in seconds.
+    """
+    if not log.is_file() or log.stat().st_mtime < started:
+        return NO_LOG
+    return last_error(log) or (NOT_ACCEPTED if _is_newer(benchmark, log) else KILLED)
+
+
 def last_error(log: Path) -> str:
     """The last error line of a log; "" without one."""
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
@@ -62,5 +78,8 @@ def last_error(log: Path) -> str:
 
 
 def _finished(log: Path, jobs: JobRecords) -> bool:
-    benchmark = jobs.benchmarks / log.relative_to(jobs.logs).with_suffix(".tsv")
+    return _is_newer(jobs.benchmarks / log.relative_to(jobs.logs).with_suffix(".tsv"), log)
+
+
+def _is_newer(benchmark: Path, log: Path) -> bool:
     return benchmark.is_file() and benchmark.stat().st_mtime >= log.stat().st_mtime

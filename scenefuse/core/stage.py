@@ -15,6 +15,7 @@ import shlex
 import shutil
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,11 @@ from typing import Any
 OUT_OF_MEMORY = (
     "the memory, or a limit on it (ulimit -v, a container's), is too small; raise the limit, end other programs, or use"
     " fewer pixels (config/presets/draft.yaml)"
+)
+# What Python and the libraries say when memory or a thread cannot be had, also while they are loaded.
+LACK_OF_MEMORY = re.compile(
+    "^MemoryError|bad_alloc|[Cc]annot allocate memory|can't allocate memory|failed to map segment|ould not load.*llvm"
+    r"|Unable to allocate|can't start new thread|what\(\): +Resource temporarily unavailable"
 )
 
 
@@ -73,10 +79,6 @@ def run(function: Callable[..., Any]) -> None:
     except StageError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
-    except MemoryError as error:
-        why = f" ({error})" if str(error) else ""
-        print(f"error: {OUT_OF_MEMORY}{why}", file=sys.stderr)
-        sys.exit(1)
     except (PermissionError, NotADirectoryError) as error:
         if error.filename is None:
             raise
@@ -89,8 +91,30 @@ def run(function: Callable[..., Any]) -> None:
         where = f" ({error.filename})" if error.filename else ""
         print(f"error: the disk is full{where}; free some space and run this again", file=sys.stderr)
         sys.exit(1)
+    except SystemExit as stop:
+        # tyro's, of words that it does not know.
+        if stop.code == 2 and "SCENEFUSE" in os.environ:
+            mixed = "two versions of scenefuse are mixed; install it again"
+            print(f"error: the stage does not know its command's options (above): {mixed}", file=sys.stderr)
+        raise
+    except Exception as error:
+        why = _lack_of_memory(error)
+        if not why:
+            raise
+        print(f"error: {OUT_OF_MEMORY} ({why})", file=sys.stderr)
+        sys.exit(1)
     if isinstance(status, int):
         sys.exit(status)
+
+
+def _lack_of_memory(error: BaseException | None) -> str:
+    """What an error, or one that it was raised from, says of memory; "" for other errors."""
+    while error is not None:
+        said = f"{type(error).__name__}: {error}".removesuffix(": ")
+        if LACK_OF_MEMORY.search(said):
+            return said
+        error = error.__cause__ or error.__context__
+    return ""
 
 
 def threads() -> int:
@@ -156,6 +180,12 @@ def _sync(path: Path) -> None:
         os.fsync(file)
     finally:
         os.close(file)
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove the temporary outputs of a file or folder that killed processes left behind."""
+    _remove_leftovers(path.parent, f".{path.stem}.tmp-", path.suffix)
+    _remove_leftovers(path.parent, f".{path.name}.tmp-")
 
 
 def _remove_leftovers(folder: Path, start: str, suffix: str = "") -> None:
@@ -241,6 +271,15 @@ def stopped_by(number: int) -> str:
     return (
         f"stopped by {signal.Signals(number).name} from outside, as Ctrl-C or a time limit sends it; run again to go on"
     )
+
+
+@contextlib.contextmanager
+def own_sigterm() -> Iterator[None]:
+    """Keep the handler of SIGTERM while pycolmap is imported, which sets one that prints a stack and aborts."""
+    before = signal.getsignal(signal.SIGTERM)
+    yield
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
 
 
 def _die_with_parent() -> None:

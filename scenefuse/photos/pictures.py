@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.core.stage import StageError
+from scenefuse.core.stage import StageError, own_sigterm
 from scenefuse.photos.photo_files import stored_size
 
 # Loses nothing that SIFT or a mask would notice.
@@ -80,7 +80,8 @@ def _read(path: Path, flags: int) -> NDArray[Any]:
 
 def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
     """Write an (H, W) float32 map of depths along the camera's z axis; 0 marks pixels without a depth."""
-    import pycolmap
+    with own_sigterm():
+        import pycolmap
 
     valid = depth[depth > 0]
     low, high = (float(valid.min()), float(valid.max())) if valid.size else (0.0, 0.0)

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.core.stage import StageError
+from scenefuse.core.stage import StageError, own_sigterm
 from scenefuse.core.transforms import Array
 from scenefuse.photos.pictures import read_gray, read_rgb
 
@@ -187,7 +187,8 @@ def read_views(folder: Path) -> list[View]:
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a COLMAP model (binary or text); StageError that names the folder when it cannot be read."""
-    import pycolmap
+    with own_sigterm():
+        import pycolmap
 
     try:
         model = pycolmap.Reconstruction(folder)
@@ -241,7 +242,8 @@ def write_model(folder: Path, views: list[View]) -> None:
 
     Views with the same lens and size share a camera.
     """
-    import pycolmap
+    with own_sigterm():
+        import pycolmap
 
     model = pycolmap.Reconstruction()
     known: dict[tuple[float, ...], int] = {}

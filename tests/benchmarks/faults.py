@@ -102,7 +102,13 @@ def workflow(*, table: Path, only: tuple[str, ...] = tuple(STAGES)) -> int:
 
 def _said(output: str) -> str:
     """The first sentence of a run that says what failed."""
-    for pattern in (r"^failed: (.*)$", r"^Error: (.*)$", r"^\w*(?:Exception|Error)[^\n]*:\n(.*)$"):
+    for pattern in (
+        r"^(another run .*)$",
+        r"^failed: (.*)$",
+        r"^(the run before .*)$",
+        r"^Error: (.*)$",
+        r"^\w*(?:Exception|Error)[^\n]*:\n(.*)$",
+    ):
         found = re.search(pattern, output, re.MULTILINE)
         if found:
             return _short(found[1])
@@ -126,9 +132,7 @@ def _power_cut(run: StubRun, job: str) -> str:
     run.plant(job, "parent SIGKILL")
     run.run()
     run.plant(job, "")
-    said = _said(run.run().stdout)
-    run.run("--unlock")
-    return f"{said}; --unlock"
+    return _said(run.run().stdout)
 
 
 def _stopped(run: StubRun, job: str) -> str:
@@ -168,6 +172,15 @@ def _two_runs(run: StubRun, job: str) -> str:
     process.communicate()
     run.plant(job, "")
     return said
+
+
+def _node_without_folder(run: StubRun, job: str) -> str:
+    """A cluster whose node cannot go to the folder: its job leaves nothing, and its scheduler says that it failed."""
+    for name, said in (("submit.sh", "7"), ("status.sh", "failed")):
+        (run.path / name).write_text(f"echo {said}\n")
+    cluster = ["--cluster-generic-submit-cmd", "sh submit.sh", "--cluster-generic-status-cmd", "sh status.sh"]
+    words = ["--executor", "cluster-generic", *cluster, "--jobs", "2", "--seconds-between-status-checks", "1"]
+    return _said(run.run(*words).stdout)
 
 
 def _deleted_output(run: StubRun, job: str) -> str:
@@ -217,14 +230,17 @@ def _photo_changed(run: StubRun, job: str) -> str:
 
 
 EXTRA: dict[str, dict[str, Callable[[StubRun, str], str]]] = {
-    "features": {"photo changed while it runs": _photo_changed},
+    "import": {"photo changed while it runs": _photo_changed},
+    "features": {"photo changed while it runs": _photo_changed, "node without the folder": _node_without_folder},
     "matching": {"output deleted": _deleted_output},
     "mapping": {"another umask": _other_umask, "output deleted": _deleted_output},
-    "stereo": {"SIGTERM of Snakemake": _stopped},
+    "undistortion": {"two runs in one folder": _two_runs},
+    "stereo": {"SIGTERM of Snakemake": _stopped, "Ctrl-C": _interrupted},
     "stage-4": {"Ctrl-C": _interrupted, "SIGTERM of Snakemake": _stopped, "output deleted": _deleted_output},
     "masks": {"Ctrl-C": _interrupted, "two runs in one folder": _two_runs},
     "registration": {"clock set back": _clock_set_back, "output deleted": _deleted_output},
     "fusion": {"clock set back": _clock_set_back, "another umask": _other_umask},
+    "completed-scene": {"node without the folder": _node_without_folder},
     "report": {"SIGTERM of Snakemake": _stopped},
 }
 

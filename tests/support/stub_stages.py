@@ -48,8 +48,8 @@ if fault.startswith("sleep "):
     except KeyboardInterrupt:
         sys.exit("error: stopped by SIGINT")
 for number, output in enumerate(outputs):
-    if number and fault == "half":
-        os.kill(os.getpid(), signal.SIGKILL)
+    if number and fault == "parent SIGKILL":
+        break
     output = pathlib.Path(output)
     folder = output.suffix == ""
     (output if folder else output.parent).mkdir(parents=True, exist_ok=True)

@@ -24,6 +24,7 @@ SCRIPT = """
 import time
 from pathlib import Path
 from scenefuse.core.stage import StageError, atomic_directory, run
+from scenefuse.photos.workspace import write_model
 
 def stage(*, out: Path, fail: bool) -> None:
     '''Write a folder.
@@ -36,6 +37,7 @@ def stage(*, out: Path, fail: bool) -> None:
         (temporary / "a.txt").write_text("a")
         if fail:
             raise StageError("the folder x is empty; give one with photos")
+        write_model(temporary, [])  # it imports pycolmap, which takes SIGTERM
         print("ready", flush=True)
         time.sleep(30)
 
@@ -164,3 +166,17 @@ def test_an_error_is_one_sentence_a_log_begins_with_the_command_and_a_signal_lea
     assert process.wait(10) == 128 + signal.SIGTERM
     assert "error: stopped by SIGTERM from outside" in process.stderr.read()
     assert [p.name for p in tmp_path.iterdir()] == ["stage.py"]
+
+
+@pytest.mark.parametrize("said", ["libtorch_cpu.so: failed to map segment from shared object", "std::bad_alloc"])
+def test_a_lack_of_memory_is_one_sentence_however_a_library_says_it(monkeypatch, capsys, said):
+    def stage():
+        try:
+            raise ImportError(said)
+        except ImportError as error:
+            raise RuntimeError("Cannot import the C++ backend") from error
+
+    monkeypatch.setattr(sys, "argv", ["stage"])
+    with pytest.raises(SystemExit, match="1"):
+        run(stage)
+    assert "is too small; raise the limit, end other programs, or use fewer pixels" in capsys.readouterr().err

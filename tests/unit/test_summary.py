@@ -1,6 +1,7 @@
 """Tables, text and page of partial runs."""
 
 import json
+import os
 import re
 import shutil
 
@@ -10,7 +11,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from scenefuse.core.job_records import JobRecords, why_unfinished
+from scenefuse.core.job_records import KILLED, NO_LOG, NOT_ACCEPTED, JobRecords, why_ended, why_unfinished
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.report.facts import closing_lines
 from scenefuse.report.run_summary import RunInputs
@@ -328,10 +329,20 @@ def test_a_killed_job_is_named_with_its_log(results):
     summary = summarise(results, ["barn"])
     text = " ".join((summary / "details.txt").read_text().split())
     assert "object barn: failed" in text and "Not run yet" not in text
-    assert (
-        "its job ended without a message: perhaps killed (out of memory?); see the log [train_depth/barn.log]" in text
-    )
+    assert "and run again to go on [train_depth/barn.log]" in text
     assert read(summary, "registration").set_index(["object", "variant"]).loc[("barn", "full"), "status"] == "failed"
+
+
+def test_a_job_without_an_error_was_killed_or_refused_or_ran_elsewhere(tmp_path):
+    log, benchmark = tmp_path / "house.log", tmp_path / "house.tsv"
+    assert why_ended(log, benchmark, 0.0) == NO_LOG
+    for file, date in ((benchmark, 100), (log, 200)):
+        file.write_text("epoch 3 of 20\n")
+        os.utime(file, (date, date))
+    assert why_ended(log, benchmark, 150.0) == KILLED  # the benchmark is of an earlier run
+    assert why_ended(log, benchmark, 250.0) == NO_LOG  # so is the log
+    os.utime(benchmark, (300, 300))
+    assert why_ended(log, benchmark, 150.0) == NOT_ACCEPTED
 
 
 def test_a_job_that_failed_in_this_run_is_the_cause_whatever_earlier_runs_left(tmp_path):

@@ -1,14 +1,13 @@
 # What the summary reads, the command that writes it, and what is still to be done when a job has failed.
 import subprocess
 
-from scenefuse.core.job_records import KILLED, last_error
+from scenefuse.core.job_records import why_ended
+from scenefuse.core.stage import own_sigterm, remove_leftovers
 from scenefuse.report.run_summary import (
     OBJECT_FILES,
     REGISTRATION_FILES,
     SCENE_FILES,
 )
-
-NOT_ACCEPTED = "Snakemake did not take its outputs for its reason above"
 
 
 def results_of(wildcards):
@@ -125,6 +124,7 @@ def record_failures():
     stopped = jobs_that_ended_badly()
     for job in stopped:
         for output in job.output:
+            remove_leftovers(Path(output))
             record = workflow.persistence.metadata(output)
             if record is not None:
                 record.params = []
@@ -137,7 +137,8 @@ def record_failures():
 
 def forecast_run():
     """What this run will take, in sentences; its jobs' seconds are left for the summary to compare."""
-    from scenefuse.report import forecast
+    with own_sigterm():
+        from scenefuse.report import forecast
 
     rows = {("scene", name): row for name, row in SCENES.items()}
     rows |= {("object", name): row for name, row in OBJECTS.items()}
@@ -225,11 +226,20 @@ def failed_logs():
 
 def print_failures():
     """Print what failed, and why."""
+    started = os.fstat(run_lock.fileno()).st_mtime
     for job in sorted(jobs_that_ended_badly(), key=lambda job: job.jobid):
-        logs = [Path(log) for log in job.log if Path(log).is_file()]
-        # A job that ended well leaves its benchmark.
-        unknown = (
-            NOT_ACCEPTED if job.benchmark and Path(job.benchmark).is_file() else KILLED
-        )
-        why = "; ".join(f"{last_error(log) or unknown} [{log}]" for log in logs)
-        print(f"failed: {job.message or job.rule.name}: {why}", file=sys.stderr)
+        for log in job.log:
+            why = why_ended(Path(log), Path(job.benchmark), started)
+            about = job.message or job.rule.name
+            print(f"failed: {about}: {why} [{log}]", file=sys.stderr)
+
+
+def hold_run_lock():
+    """Hold a file among Snakemake's locks until this process ends."""
+    global run_lock
+    RUN_LOCK.parent.mkdir(parents=True, exist_ok=True)
+    run_lock = RUN_LOCK.open("w")
+    try:
+        fcntl.flock(run_lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        RUN_LOCK.unlink()

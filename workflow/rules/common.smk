@@ -1,4 +1,5 @@
 # What the rules share: the project, its files, and how settings become command lines.
+import fcntl
 import glob
 import os
 import re
@@ -18,6 +19,8 @@ from scenefuse.core.machine import has_gpu, megapixels, memory_mb
 from scenefuse.photos.photo_files import GEO_FILE, camera_files, photo_files
 from scenefuse.core.stage import StageError
 
+# A file that a run holds until it ends, among Snakemake's locks and removed with them.
+RUN_LOCK = Path(".snakemake/locks/run")
 # Records of the jobs and logs take so much at least.
 MIN_FREE_BYTES = 2**20
 
@@ -93,6 +96,26 @@ if workflow.is_main_process and workflow.global_resources["_nodes"].value is Non
     SCENE_THREADS = min(8, max(OBJECT_THREADS, cores // 2))
 else:
     SCENE_THREADS = OBJECT_THREADS = 8
+
+
+def remove_dead_lock():
+    """Remove the locks of a run on this machine that was killed: no process holds its file any more."""
+    if RUN_LOCK.exists():
+        with RUN_LOCK.open() as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                print(
+                    "another run works in this folder; wait until it ends, or stop it",
+                    file=sys.stderr,
+                )
+                return
+        shutil.rmtree(RUN_LOCK.parent)
+        print("the run before this one was killed; this one goes on", file=sys.stderr)
+
+
+if workflow.is_main_process and workflow.global_resources["_nodes"].value is None:
+    remove_dead_lock()
 
 
 wildcard_constraints:

@@ -238,6 +238,7 @@ rule write_report:
 
 
 onstart:
+    hold_run_lock()
     for line in forecast_run():
         print(line, file=sys.stderr)
     mark_as_unfinished()
