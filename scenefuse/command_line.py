@@ -11,6 +11,28 @@ from scenefuse.core.version import VERSION
 
 ALL = "pip install 'scenefuse[all]'"
 OWN_SETTINGS, SCENES = Path("config/config.yaml"), Path("config/scenes.tsv")
+RUN_HELP = """\
+usage: scenefuse run [FILE ...] [OPTION ...]    in the folder of a project
+
+Makes what is missing or no longer up to date: all, or the given files, as results/objects/NAME/fused.ply.
+
+  -n, --dry-run            say what would run, and why
+  --cores N                processor cores; all, where it is left out
+  --configfile FILE ...    settings in place of config/config.yaml
+  --directory FOLDER       the project, where it is not this folder
+  --forcerun RULE ...      make the outputs of a rule again
+  --until RULE ...         stop after a rule
+  --resources mem_mb=N     use no more memory than this
+  --profile FOLDER         on a cluster
+  --printshellcmds         print the command of each job
+  --report FILE.html       no run; a report of what made the results
+  --unlock                 go on after a run that was killed
+  --version                of Snakemake
+
+All options are Snakemake's: python -m snakemake --help
+"""
+# Snakemake's options that say how much runs at a time, or that another machine decides it.
+PARALLEL = ("--cores", "-c", "--jobs", "-j", "--profile", "--workflow-profile", "--executor", "-e")
 
 
 def main() -> None:
@@ -82,42 +104,54 @@ def _takes_own_settings() -> bool:
     return OWN_SETTINGS.is_file() and not any(word.startswith("--configfile") for word in sys.argv[1:])
 
 
-def _configfiles() -> list[str]:
+def _configfiles() -> list[Path]:
     """The files after --configfile, or --configfiles; its values go on up to the next option."""
-    found, taking = list[str](), False
+    found, taking = list[Path](), False
     for word in sys.argv[1:]:
         name, equals, given = word.partition("=")
         if word.startswith("-"):
             taking = name in ("--configfile", "--configfiles")
-            found += [given] if taking and equals else []
+            found += [Path(given)] if taking and equals else []
         elif taking:
-            found.append(word)
+            found.append(Path(word))
     return found
 
 
 def _run() -> None:
     """run the workflow in this folder, by Snakemake and with its options"""
-    from scenefuse.core.settings import ROOT
+    from scenefuse.complete import snakemake_command
+    from scenefuse.core.stage import StageError
 
     if find_spec("snakemake") is None:
         raise ModuleNotFoundError(name="snakemake")
+    if {"-h", "--help"} & set(sys.argv):
+        print(RUN_HELP, end="")
+        return
     # Options of Snakemake that say where the project is, or that none is needed.
-    _need_project("--config", "--directory", "-d", "-h", "--help", "--version")
+    _need_project("--config", "--directory", "-d", "--version")
     own = ["--configfile", str(OWN_SETTINGS)] if _takes_own_settings() else []
-    for path in [*_configfiles(), *own[1:]]:
-        if not Path(path).is_file():
-            sys.exit(f"error: the settings file {path} cannot be read; correct its path")
-        if b"__use_yte__" in Path(path).read_bytes():
-            sys.exit(f"error: {path} asks Snakemake to run Python in it; remove __use_yte__ (docs/trust.md)")
-    words = [*own, *sys.argv[1:]]
-    # As `python -m snakemake`, but its help and errors name the command that was typed.
-    start = "import sys; sys.argv[0] = 'scenefuse run'; from snakemake.cli import main; main()"
-    command = [sys.executable, "-c", start, "--snakefile", str(ROOT / "Snakefile"), *words]
+    own += [] if any(word.startswith(PARALLEL) for word in sys.argv[1:]) else ["--cores", "all"]
+    files = _configfiles() or ([OWN_SETTINGS] if _takes_own_settings() else [])
+    try:
+        command = snakemake_command([*sys.argv[1:], *own], files)
+    except StageError as error:
+        sys.exit(f"error: {error}")
     # The process becomes Snakemake: signals and the exit status are its own.
     os.execv(sys.executable, command)
 
 
+def _complete() -> None:
+    """complete objects in a scene: photos in, the completed cloud and a report out"""
+    from scenefuse.complete import complete
+    from scenefuse.core.stage import run
+
+    if find_spec("snakemake") is None:
+        raise ModuleNotFoundError(name="snakemake")
+    run(complete)
+
+
 PARTS: dict[str, Callable[[], None]] = {
+    "complete": _complete,
     "register": _register,
     "init": _init,
     "pick": _pick,

@@ -1,7 +1,9 @@
 """A folder for a project of one's own: tables, settings and a text that says what comes next."""
 
 import re
+import shlex
 import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -9,11 +11,15 @@ import tyro
 
 from scenefuse.cloud.formats import READERS
 from scenefuse.core.settings import ROOT, schema_of
-from scenefuse.core.stage import StageError
+from scenefuse.core.stage import StageError, atomic_file
+from scenefuse.core.tables import Row, read_table
 from scenefuse.photos.photo_files import VIDEO_SUFFIXES, in_folders, photo_files
 
-SCENES = ("scene", "photos", "cameras", "cloud", "crs")
-OBJECTS = ("object", "scene", "photos", "cameras", "cloud", "prompts", "fiducials")
+SCENES, OBJECTS = Path("config/scenes.tsv"), Path("config/objects.tsv")
+COLUMNS = {
+    SCENES: ("scene", "photos", "cameras", "cloud", "crs"),
+    OBJECTS: ("object", "scene", "photos", "cameras", "cloud", "prompts", "fiducials"),
+}
 SETTINGS = """\
 # Settings that differ from the shipped ones; `scenefuse run` reads this file. All of them, with their shipped values:
 # {root}/config/README.md
@@ -21,17 +27,17 @@ SETTINGS = """\
 README = """\
 # {name}
 
-1. `config/scenes.tsv` needs a row for each scene: the folder of the drone's photos, or a cloud; or the photos, cameras
+1. `config/scenes.tsv` has a row for each scene: the folder of the drone's photos, or a cloud; or the photos, cameras
    and dense cloud of a finished project of another program.
-2. `config/objects.tsv` needs a row for each object: its scene and its close-up photos (a folder, a video), or a cloud.
+2. `config/objects.tsv` has a row for each object: its scene and its close-up photos (a folder, a video), or a cloud.
    Without a scene, an object's photos become a cloud by themselves.
    In both tables, cells are separated by tabs; their columns are explained below.
 3. Say what the object is:
-   - for photos: `scenefuse pick --configfile config/config.yaml --object NAME` opens a page to click on it;
+   - for photos: `scenefuse pick --object {object}` opens a page to click on it;
    - where the scene or the object is a cloud, and the scene shows much more than the object: name a text file in the
      column `fiducials` with at least four points around the object, a line `x y z` each, in the scene's coordinates.
-4. `scenefuse run -n` says what would run, `scenefuse run --cores 2` runs it; options are Snakemake's.
-5. With photos, look at `results/objects/NAME/masks.png` first; then open `results/summary/report.html`.
+4. `scenefuse run -n` says what would run, `scenefuse run` runs it; options are Snakemake's.
+5. With photos, look at `results/objects/{object}/masks.png` first; then open `results/summary/report.html`.
 """
 
 
@@ -54,25 +60,25 @@ def init(
         StageError: the folder is a file or holds a project, a path is neither photos nor a cloud, or two names are the
             same.
     """
+    rows = make_project(folder, scene, objects, preset)
+    clicks = (f"scenefuse pick --object {row['object']}" for row in rows[OBJECTS] if "photos" in row)
+    print(
+        f"next: cd {shlex.quote(str(folder))} && {next(clicks, 'scenefuse run')}    (README.md there says more)",
+        flush=True,
+    )
+
+
+def make_project(folder: Path, scene: Path | None, objects: Sequence[Path], preset: str) -> dict[Path, list[Row]]:
+    """Make the project and say what is in it; returns the rows of its tables. Arguments and errors as of `init`."""
     if set("{}") & set(str(folder.resolve())):
         raise StageError(f"{folder.resolve()} has braces, which Snakemake takes for wildcards; give another folder")
-    names = [_name(path) for path in objects]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise StageError(f"two objects would be called '{twice}'; rename one of their folders or files")
-    scene_name = "" if scene is None else _name(scene)
-    scenes = [] if scene is None else [{"scene": scene_name} | _source(scene, folder, video=False)]
-    rows = [
-        {"object": name, "scene": scene_name} | _source(path, folder, video=True) for name, path in zip(names, objects)
-    ]
-    for row in rows:
-        # Where `pick` saves what is clicked.
-        row |= {"prompts": f"config/{row['object']}_prompts.tsv"} if "photos" in row else {}
+    rows = project_rows(folder, scene, objects)
+    names = [row["object"] for row in rows[OBJECTS]] or ["NAME"]
+    text = README.format(name=folder.resolve().name, object=names[0])
     texts = {
-        "config/scenes.tsv": _table("scenes", SCENES, scenes),
-        "config/objects.tsv": _table("objects", OBJECTS, rows),
+        **{path.as_posix(): _table(COLUMNS[path], rows[path]) for path in rows},
         "config/config.yaml": SETTINGS.format(root=ROOT) + (ROOT / f"config/presets/{preset}.yaml").read_text(),
-        "README.md": README.format(name=folder.resolve().name) + _columns("scenes") + _columns("objects"),
+        "README.md": text + _columns("scenes") + _columns("objects"),
     }
     for path in (folder / name for name in texts):
         if path.exists() or (folder.exists() and not folder.is_dir()):
@@ -80,13 +86,43 @@ def init(
     for name, text in texts.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
-    for path, name in [*([] if scene is None else [(scene, scene_name)]), *zip(objects, names)]:
+    for path in [*([] if scene is None else [scene]), *objects]:
+        if path.is_dir():
+            print(f"{path} holds {in_folders([f.relative_to(path).as_posix() for f in photo_files(path)])}", flush=True)
+        name = default_name(path)
         renamed = "" if name == _stem(path) else "; names hold only A-Z, a-z, 0-9, _ and -"
         print(f"{path} is called {name} in the tables and results{renamed}", flush=True)
-    print(f"{folder}/README.md says what comes next", flush=True)
+    return rows
 
 
-def _name(path: Path) -> str:
+def project_rows(folder: Path, scene: Path | None, objects: Sequence[Path]) -> dict[Path, list[Row]]:
+    """The rows of a project's tables; its columns are those that are filled. Errors as of `init`."""
+    names = [default_name(path) for path in objects]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise StageError(f"two objects would be called '{twice}'; rename one of their folders or files")
+    scene_name = "" if scene is None else default_name(scene)
+    scenes = [] if scene is None else [{"scene": scene_name} | _source(scene, folder, video=False)]
+    rows = [
+        {"object": name, "scene": scene_name} | _source(path, folder, video=True) for name, path in zip(names, objects)
+    ]
+    for row in rows:
+        # Where `pick` saves what is clicked.
+        row |= {"prompts": f"config/{row['object']}_prompts.tsv"} if "photos" in row else {}
+    return {SCENES: scenes, OBJECTS: rows}
+
+
+def fill(table: Path, column: str, cells: Mapping[str, str]) -> None:
+    """Write the cells of a column of a table of objects, by their names."""
+    rows = read_table(table, "object")
+    for name, cell in cells.items():
+        rows[name][column] = cell
+    columns = tuple(dict.fromkeys([*next(iter(rows.values())), column]))
+    with atomic_file(table) as temporary:
+        temporary.write_text(_table(columns, rows.values()), encoding="utf-8")
+
+
+def default_name(path: Path) -> str:
     """A name for the tables from that of a file or folder; letters lose their accents."""
     letters = "".join(a for a in unicodedata.normalize("NFKD", _stem(path)) if not unicodedata.combining(a))
     return re.sub(r"[^A-Za-z0-9_-]+", "_", letters).strip("-_") or "_"
@@ -103,20 +139,24 @@ def _source(path: Path, folder: Path, *, video: bool) -> dict[str, str]:
         raise StageError(f"{path} does not exist; give {wanted}")
     suffix = path.suffix.lower()
     is_cloud = path.is_file() and suffix in READERS
-    place, project = path.resolve(), folder.resolve()
     if path.is_dir():
-        if project.is_relative_to(place):
+        if folder.resolve().is_relative_to(path.resolve()):
             raise StageError(f"the project {folder} would lie among its photos in {path}; give a folder of its own")
-        print(f"{path} holds {in_folders([f.relative_to(path).as_posix() for f in photo_files(path)])}", flush=True)
+        photo_files(path)
     elif not (is_cloud or (video and suffix in VIDEO_SUFFIXES)):
         raise StageError(f"{path} is not {wanted.replace('or a', 'nor a')} ({', '.join(READERS)})")
     elif path.stat().st_size == 0:
         raise StageError(f"{path} is empty; export it again")
-    cell = place.relative_to(project) if place.is_relative_to(project) else place
-    return {"cloud" if is_cloud else "photos": cell.as_posix()}
+    return {"cloud" if is_cloud else "photos": cell_of(path, folder)}
 
 
-def _table(kind: str, columns: tuple[str, ...], rows: list[dict[str, str]]) -> str:
+def cell_of(path: Path, folder: Path) -> str:
+    """A path as a table of a project names it: relative to the project if it lies inside."""
+    place, project = path.resolve(), folder.resolve()
+    return (place.relative_to(project) if place.is_relative_to(project) else place).as_posix()
+
+
+def _table(columns: tuple[str, ...], rows: Iterable[Row]) -> str:
     """A table with these columns and rows."""
     lines = ["\t".join(columns), *("\t".join(row.get(name, "") for name in columns) for row in rows)]
     return "\n".join(lines) + "\n"

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,11 @@ def memory_mb() -> int:
 def has_gpu() -> bool:
     """Whether an NVIDIA card is there: its driver's device files, or its tool (as under WSL)."""
     return any(Path("/dev").glob("nvidia[0-9]*")) or shutil.which("nvidia-smi") is not None
+
+
+def has_screen() -> bool:
+    """Whether a program that is started here can open a window."""
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def megapixels(folder: Path, width_px: int | None = None) -> float:

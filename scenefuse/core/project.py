@@ -3,14 +3,23 @@
 The workflow imports this whenever it plans: nothing here takes long to import.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from scenefuse.core.settings import ROOT, merge, problem, read_differences, schema_of, with_defaults
+from scenefuse.core.settings import (
+    ROOT,
+    merge,
+    place_of,
+    problem,
+    problem_at,
+    read_differences,
+    schema_of,
+    with_defaults,
+)
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import Row, read_table
 
@@ -50,16 +59,20 @@ class Project:
         return merge(self.of("object", name)["registration"], self.variants[variant])
 
 
-def read_project(config: Mapping[str, Any]) -> Project:
+def read_project(config: Mapping[str, Any], files: Iterable[Path] = ()) -> Project:
     """The project that a configuration describes; relative paths are the working directory's, then the repository's.
+
+    Args:
+        config: settings that differ from the shipped ones.
+        files: that they were read from, for messages.
 
     Raises:
         StageError: the first thing that is wrong, with its file and place.
     """
     schema = schema_of("config")
-    wrong = problem(config, schema)
+    keys, wrong = problem_at(config, schema)
     if wrong:
-        raise StageError(f"config, {wrong}")
+        raise StageError(f"{next(filter(None, (place_of(keys, file) for file in files)), 'config')}, {wrong}")
     settings = with_defaults(config, schema)
     scenes, objects = (_checked_table(settings[f"{kind}s"], kind) for kind in ("scene", "object"))
     if not scenes and not objects:

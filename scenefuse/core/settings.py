@@ -3,7 +3,7 @@
 import dataclasses
 import difflib
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -38,21 +38,38 @@ def schema_of(name: str) -> dict[str, Any]:
 
 def problem(content: Any, schema: Mapping[str, Any]) -> str | None:
     """The first thing in `content` that a JSON schema does not allow, as one sentence that begins with its key."""
+    return problem_at(content, schema)[1]
+
+
+def problem_at(content: Any, schema: Mapping[str, Any]) -> tuple[list[Any], str | None]:
+    """The keys that lead to what `problem` says, and its sentence; None where nothing is wrong."""
     if _grows(content):
-        return "aliases of YAML expand without end; write what they stand for"
+        return [], "aliases of YAML expand without end; write what they stand for"
     for error in jsonschema.Draft202012Validator(schema).iter_errors(content):
-        key = ".".join(str(part) for part in error.absolute_path)
-        message = error.message
+        keys, message = list(error.absolute_path), error.message
+        where = ".".join(map(str, keys))
         if error.validator == "additionalProperties":
             known = list(error.schema["properties"])
             unknown = next(name for name in error.instance if name not in known)
             close = difflib.get_close_matches(str(unknown), known, 1)
             advice = f"did you mean '{close[0]}'?" if close else f"known keys are: {', '.join(known)}"
-            message = f"unknown key '{unknown}'; {advice}"
+            keys, message = [*keys, unknown], f"unknown key '{unknown}'; {advice}"
         elif error.validator == "pattern" and "advice" in error.schema:
             message = f"'{error.instance}' will not do; {error.schema['advice']}"
-        return f"{key}: {message}" if key else message
-    return None
+        return keys, f"{where}: {message}" if where else message
+    return [], None
+
+
+def place_of(keys: Sequence[Any], path: Path) -> str | None:
+    """A settings file and the line of a key in it, for a message; None where the file does not hold the key."""
+    node, line = yaml.compose(path.read_text(), yaml.SafeLoader), 0
+    for key in keys:
+        found = [pair for pair in node.value if pair[0].value == str(key)] if isinstance(node, yaml.MappingNode) else []
+        if not found:
+            # An item of a list stands where the list does.
+            return f"{path}, line {line + 1}" if isinstance(node, yaml.SequenceNode) else None
+        line, node = found[-1][0].start_mark.line, found[-1][1]
+    return f"{path}, line {line + 1}" if keys else str(path)
 
 
 def with_defaults(content: Mapping[str, Any], schema: Mapping[str, Any]) -> dict[str, Any]:
@@ -79,13 +96,16 @@ def read_differences(mine: Path) -> dict[str, Any]:
         own = yaml.safe_load(mine.read_text()) or {}
     except OSError:
         raise StageError(f"the settings file {mine} cannot be read; correct its path") from None
+    except yaml.MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
+        raise StageError(f"{mine} is no YAML ({line}{error.problem}); correct it") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise StageError(f"{mine} is no YAML ({' '.join(str(error).split())}); correct it") from None
     if not isinstance(own, dict):
         raise StageError(f"{mine} holds no settings; write keys as in config/config.yaml, `registration:` first")
-    wrong = problem(own, schema_of("config"))
+    keys, wrong = problem_at(own, schema_of("config"))
     if wrong:
-        raise StageError(f"{mine}, {wrong}")
+        raise StageError(f"{place_of(keys, mine) or mine}, {wrong}")
     return own
 
 

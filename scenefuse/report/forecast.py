@@ -36,7 +36,7 @@ IDLE_FACTOR = 1.15
 # A forecast is right within this factor: what is short by more cannot do.
 ERROR_FACTOR = 1.5
 # Its file in the folder of logs, and columns.
-FORECAST, COLUMNS = "forecast.tsv", ["benchmark", "seconds"]
+FORECAST, COLUMNS = "forecast.tsv", ["benchmark", "seconds", "last_run"]
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def forecast_lines(
     largest = sorted(seconds, key=lambda rule: -seconds[rule])[:3]
     most = max(memory_mb, key=lambda rule: memory_mb[rule])
     lines = [
-        f"time: about {_duration(IDLE_FACTOR * total / cores)} on {cores} {'core' if cores == 1 else 'cores'} like the"
+        f"time: about {duration(IDLE_FACTOR * total / cores)} on {cores} {'core' if cores == 1 else 'cores'} like the"
         f" demo's; most of it for {', '.join(largest)}",
         f"memory: up to {size_text(1e6 * memory_mb[most])} in one job ({most})",
     ]
@@ -203,23 +203,47 @@ def _disk(needed: Mapping[Path, int | None], keep_maps: bool) -> list[str]:
     return [line + (f"; that is too little: {advice}" if more > free else "")]
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Hours and minutes, as people write them."""
     hours, minutes = divmod(max(1, round(seconds / 60)), 60)
     return f"{hours} h {minutes} min" if hours else f"{minutes} min"
 
 
 def write_forecast(path: Path, seconds: Mapping[str, float]) -> None:
-    """Write the seconds that jobs will take, by their benchmark's file; an earlier forecast of other jobs stays."""
+    """Write the seconds that the jobs of a run will take, by their benchmark's file; those of jobs before stay."""
     earlier = read_forecast(path)
     with atomic_file(path) as temporary:
-        rows = sorted((earlier | dict(seconds)).items())
+        rows = [(name, cost, int(name in seconds)) for name, cost in sorted((earlier | dict(seconds)).items())]
         pd.DataFrame(rows, columns=COLUMNS).to_csv(temporary, sep="\t", index=False, float_format="%.1f")
 
 
-def read_forecast(path: Path) -> dict[str, float]:
-    """What `write_forecast` wrote; empty where nothing is, or nothing that can be read."""
+def read_forecast(path: Path, of_last_run: bool = False) -> dict[str, float]:
+    """What `write_forecast` wrote, or its jobs of the last run; empty where nothing is, or nothing that can be read."""
     try:
         table = pd.read_csv(path, sep="\t")
+        table = table[table[COLUMNS[2]] == 1] if of_last_run else table
         return dict(zip(table[COLUMNS[0]].astype(str), table[COLUMNS[1]].astype(float)))
     except (OSError, ValueError, KeyError):
         return {}
+
+
+def seconds_left(forecast: Mapping[str, float], folder: Path, started: float, cores: int) -> float:
+    """Seconds of the clock that a run will still take, by its forecast and the processor seconds of its jobs so far.
+
+    Args:
+        forecast: seconds of one core, by the benchmark's file of each job of the run.
+        folder: that the run works in.
+        started: when it started, as files' dates have it.
+        cores: that jobs share.
+    """
+    taken, done = 0.0, 0.0
+    for name, seconds in forecast.items():
+        file = folder / name
+        if file.is_file() and file.stat().st_mtime >= started:
+            # Snakemake measures nothing of a job of less than a moment.
+            taken += float(pd.to_numeric(pd.read_csv(file, sep="\t")["cpu_time"], errors="coerce").fillna(0).sum())
+            done += seconds
+    total = sum(forecast.values())
+    # What is left takes longer than forecast, as what is done did; the more is done, the more is known of that.
+    slower = (taken + total - done) / total if total else 1.0
+    return IDLE_FACTOR * slower * (total - done) / cores

@@ -15,7 +15,8 @@ PACKAGES += ["register", "fuse", "metrics", "report", "paper", "pick", "two_clou
 MAY_IMPORT = {name: set(PACKAGES[: PACKAGES.index(name) + 1]) for name in PACKAGES}
 # The demo is outside the library: it writes captures and their truth, and no package imports it.
 MAY_IMPORT |= {"demo": {"core", "cloud", "photos", "metrics", "demo"}, "config": {*PACKAGES, "demo"}}
-MAY_IMPORT |= {"new_project": {"core", "cloud", "photos"}, "command_line": {*PACKAGES, "new_project"}}
+MAY_IMPORT |= {"new_project": {"core", "cloud", "photos"}, "complete": {"core", "report", "new_project"}}
+MAY_IMPORT |= {"command_line": {*PACKAGES, "new_project", "complete"}}
 MAY_IMPORT |= {"__main__": {"command_line"}}
 CORE = ("field", "kernels", "triton_kernels", "rays", "render", "losses", "training")
 CORE += ("appearance",)

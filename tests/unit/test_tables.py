@@ -169,7 +169,7 @@ def test_a_scene_has_settings_of_its_own_too(own_project):
         (
             "object: {nerf: {widht: 1}}",
             "objects",
-            "object 'shed': own.yaml, object.nerf: unknown key 'widht'",
+            "object 'shed': own.yaml, line 1, object.nerf: unknown key 'widht'",
         ),
         (
             "scene: {matches: {max_ratio: 0.8}}",

@@ -57,7 +57,7 @@ os.environ.update(
 )
 
 try:
-    PROJECT = read_project(config)
+    PROJECT = read_project(config, map(Path, workflow.overwrite_configfiles))
 except StageError as error:
     raise WorkflowError(str(error)) from None
 config.update(PROJECT.settings)

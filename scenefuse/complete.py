@@ -1,0 +1,216 @@
+"""`scenefuse complete`: from folders of photos to the completed scene; the same command again goes on."""
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import webbrowser
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from scenefuse.core.machine import has_screen
+from scenefuse.core.settings import PACKAGE, ROOT, read_differences
+from scenefuse.core.stage import StageError
+from scenefuse.core.tables import read_cells, read_table
+from scenefuse.new_project import OBJECTS, SCENES, cell_of, default_name, fill, make_project, project_rows
+from scenefuse.report.facts import closing_lines
+from scenefuse.report.forecast import FORECAST, duration, read_forecast, seconds_left
+
+OWN_SETTINGS, LOG = Path("config/config.yaml"), Path("results/logs/run.log")
+SUMMARY = Path("results/summary")
+# Lines of a run that people want to see, or that say why it failed.
+JOB, FORECAST_LINE = re.compile(r"Job \d+: (.+)"), re.compile("(time|memory|disk): .+")
+ERROR, FAILED, CLOSING = re.compile(r"\w*(Error|Exception)\b.*:"), ("failed: ", "error: "), "Result: "
+Preset = Literal["draft", "normal", "high"]
+Folder = tyro.conf.Positional[Path]
+
+
+def complete(
+    flight: Annotated[Folder, tyro.conf.arg(metavar="FLIGHT")],
+    house: Annotated[Folder, tyro.conf.arg(metavar="HOUSE")],
+    others: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[SHED ...]")] = (),
+    *,
+    out: Path | None = None,
+    prompts: tuple[Path, ...] = (),
+    masks: tuple[Path, ...] = (),
+    preset: Preset = "normal",
+    cores: int | None = None,
+    no_browser: tyro.conf.UseCounterAction[int] = 0,
+) -> None:
+    """Complete objects in a drone reconstruction: makes a project, opens the page to click on each object, runs the
+    workflow, and opens the report. The same command again goes on where it was left.
+
+    Args:
+        flight: photos of the scene (a folder), or its cloud.
+        house: close-up photos of an object in it (a folder or a video), or its cloud.
+        others: the same of more objects.
+        out: folder of the project; where it is left out, FLIGHT_completed.
+        prompts: tables of clicks, one for each object in its order, in place of the page.
+        masks: folders of masks, one for each object in its order, named like its photos; white is the object.
+        preset: of a new project: settings for a first look, the shipped ones, or larger ones for a GPU.
+        cores: processor cores; where it is left out, all.
+        no_browser: open neither the page nor the report.
+
+    Raises:
+        StageError: a folder is not what it should be, an object has no clicks, or the run failed.
+    """
+    objects, shows = (house, *others), has_screen() and not no_browser
+    project = out or Path(f"{default_name(flight)}_completed")
+    _make_or_go_on(project, flight, objects, preset)
+    for column, given in (("prompts", prompts), ("masks", masks)):
+        _name_files(project, column, given, objects)
+    for name in _without_clicks(project, cores):
+        _click(project, name, shows)
+    _run_workflow(project, [], cores)
+    print(closing_lines(project / SUMMARY), flush=True)
+    if shows:
+        webbrowser.open((project / SUMMARY / "report.html").resolve().as_uri())
+
+
+def _make_or_go_on(project: Path, flight: Path, objects: Sequence[Path], preset: Preset) -> None:
+    """Make the project, where it is not there yet.
+
+    Raises:
+        StageError: the folder holds another project.
+    """
+    if not (project / SCENES).is_file():
+        make_project(project, flight, objects, preset)
+        return
+    for table, rows in project_rows(project, flight, objects).items():
+        kind = table.stem.removesuffix("s")
+        there = read_table(project / table, kind)
+        for row in rows:
+            held = there.get(row[kind], {})
+            if any(held.get(key) != row[key] for key in row if key != "prompts"):
+                raise StageError(
+                    f"{project} holds another project, whose {kind}s are: {', '.join(there)}; give another folder by"
+                    f" --out, or add {row[kind]} to {project / table} and use scenefuse run in {project}"
+                )
+    print(f"Going on with {project}", flush=True)
+
+
+def _name_files(project: Path, column: str, given: Sequence[Path], objects: Sequence[Path]) -> None:
+    """Name files or folders, one for each object, in a column of the objects' table."""
+    if given and len(given) != len(objects):
+        raise StageError(f"--{column} names {len(given)} for {len(objects)} objects; give one for each, in their order")
+    missing = next((path for path in given if not path.exists()), None)
+    if missing is not None:
+        raise StageError(f"{missing} does not exist; correct --{column}")
+    if given:
+        fill(project / OBJECTS, column, {default_name(o): cell_of(path, project) for o, path in zip(objects, given)})
+
+
+def _without_clicks(project: Path, cores: int | None) -> list[str]:
+    """Names of the objects that nothing says yet what they are; of a video, its frames are there then."""
+    found = []
+    for name, row in read_table(project / OBJECTS, "object").items():
+        clicks = project / (row.get("prompts") or f"config/{name}_prompts.tsv")
+        if row.get("photos") and not row.get("masks") and not (clicks.is_file() and len(read_cells(clicks)) > 1):
+            found.append(name)
+            frames = Path("results/objects", name, "photos.json")
+            if (project / row["photos"]).is_file() and not (project / frames).is_file():
+                _run_workflow(project, [str(frames)], cores)
+    return found
+
+
+def _click(project: Path, name: str, shows: bool) -> None:
+    """Let a person click on an object, in a page that ends by its button.
+
+    Raises:
+        StageError: nobody can, or nobody did.
+    """
+    by_file = (
+        f"give its clicks by --prompts FILE or its masks by --masks FOLDER, or click in {project} by scenefuse pick"
+    )
+    if not shows and not sys.stdin.isatty():
+        raise StageError(f"{name} has no clicks yet, and there is no screen to click on; {by_file}")
+    print(f"{name}: click on it in the page{'' if shows else f', or {by_file}'}", flush=True)
+    command = [sys.executable, "-m", "scenefuse", "pick", "--object", name, *([] if shows else ["--no-browser"])]
+    status = subprocess.run(command, cwd=project, env=_environment()).returncode
+    if status or name in _without_clicks(project, None):
+        raise StageError(f"{name} has no clicks yet; run the same command again and click on it, or {by_file}")
+
+
+def snakemake_command(words: Sequence[str], configfiles: Iterable[Path]) -> list[str]:
+    """The command that runs the workflow by Snakemake, with its options; settings files are checked before.
+
+    Raises:
+        StageError: a settings file cannot be read, or holds what it may not.
+    """
+    for path in configfiles:
+        if path.is_file() and b"__use_yte__" in path.read_bytes():
+            raise StageError(f"{path} asks Snakemake to run Python in it; remove __use_yte__")
+        read_differences(path)
+    # As `python -m snakemake`, but its help and errors name the command that was typed.
+    start = "import sys; sys.argv[0] = 'scenefuse run'; from snakemake.cli import main; main()"
+    return [sys.executable, "-c", start, "--snakefile", str(ROOT / "Snakefile"), *words]
+
+
+def _environment() -> dict[str, str]:
+    """This process's, in which this library is found from every folder."""
+    return os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(PACKAGE.parent), os.environ.get("PYTHONPATH")]))
+    }
+
+
+def _run_workflow(project: Path, targets: list[str], cores: int | None) -> None:
+    """Run the workflow; a line for each step, what else Snakemake says goes into a file.
+
+    Raises:
+        StageError: it failed.
+    """
+    cores = cores or os.cpu_count() or 1
+    words = ["--configfile", str(OWN_SETTINGS), "--cores", str(cores), *targets]
+    command, log = snakemake_command(words, [project / OWN_SETTINGS]), project / LOG
+    log.parent.mkdir(parents=True, exist_ok=True)
+    print(f"Running on {cores} {'core' if cores == 1 else 'cores'}; all that Snakemake says: {log}", flush=True)
+    started = time.time()
+    with open(log, "w") as written, open(log, errors="replace") as read:
+        # In a session of its own, so that Ctrl-C reaches it once, from here.
+        process = subprocess.Popen(
+            command, cwd=project, env=_environment(), stdout=written, stderr=subprocess.STDOUT, start_new_session=True
+        )
+        try:
+            ended = False
+            while not ended:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(timeout=1)
+                    ended = True
+                for line in read:
+                    _report_step(project, line.rstrip(), started, cores)
+        except BaseException:
+            process.send_signal(signal.SIGINT)
+            process.wait()
+            raise
+    if process.returncode:
+        lines = log.read_text(errors="replace").splitlines()
+        if any(line.startswith(CLOSING) for line in lines):
+            print(closing_lines(project / SUMMARY), flush=True)
+        raise StageError(f"{_why(lines)}; all that Snakemake says: {log}")
+
+
+def _report_step(project: Path, line: str, started: float, cores: int) -> None:
+    """Print a line of the log, if it says what a run will take or that a job starts; with the time left."""
+    job = JOB.fullmatch(line)
+    if FORECAST_LINE.fullmatch(line):
+        print(line[0].upper() + line[1:], flush=True)
+    elif job:
+        planned = read_forecast(project / "results/logs" / FORECAST, of_last_run=True)
+        left = duration(seconds_left(planned, project, started, cores))
+        print(f"{time.strftime('%H:%M')} {job[1]}; about {left} left", flush=True)
+
+
+def _why(lines: Sequence[str]) -> str:
+    """Why a run failed, from its log: the jobs that failed, else the first error."""
+    for start in FAILED:
+        said = [line.removeprefix(start) for line in lines if line.startswith(start)]
+        if said:
+            return "; ".join(said)
+    after = (text for line, text in zip(lines, lines[1:]) if ERROR.fullmatch(line))
+    return next(after, "Snakemake ended early")

@@ -1,0 +1,213 @@
+"""`scenefuse complete` and `run`: what they make, start and say; Snakemake is a stand-in here."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+from support.user_project import CLICKS, Project
+
+from scenefuse import command_line, complete
+from scenefuse.core.settings import read_differences
+from scenefuse.core.stage import StageError
+from scenefuse.core.tables import read_table
+from scenefuse.new_project import init
+from scenefuse.report.forecast import read_forecast, seconds_left, write_forecast
+
+SUMMARY = """
+import pathlib
+summary = pathlib.Path("results/summary")
+summary.mkdir(parents=True)
+(summary / "scenes.tsv").write_text("scene\\nflight\\n")
+(summary / "objects.tsv").write_text("object\\tstatus\\nclose\\tregistered\\n")
+(summary / "report.html").touch()
+"""
+
+
+@pytest.fixture
+def two_folders(tmp_path, monkeypatch):
+    """The working directory, with photos in flight/ and close/, and no screen."""
+    project = Project(tmp_path)
+    project.photos("flight")
+    project.photos("close")
+    (tmp_path / "clicks.tsv").write_text(CLICKS)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(complete, "has_screen", lambda: False)
+    return tmp_path
+
+
+@pytest.fixture
+def workflow(monkeypatch):
+    """Let a Python program run in Snakemake's place."""
+
+    def use(program: str) -> None:
+        monkeypatch.setattr(complete, "snakemake_command", lambda words, files: [sys.executable, "-c", program])
+
+    return use
+
+
+def run(*objects: str, **options) -> None:
+    complete.complete(Path("flight"), Path(objects[0]), tuple(map(Path, objects[1:])), **options)
+
+
+def test_two_folders_and_clicks_become_a_project_and_its_run(two_folders, workflow, capsys):
+    workflow(
+        f"{SUMMARY}\nprint('time: about 3 min on 2 cores')\nprint('Select jobs ...')\nprint('Job 3: close: masks')"
+    )
+    run("close", prompts=(Path("clicks.tsv"),), cores=2)
+    said = capsys.readouterr().out.splitlines()
+    row = read_table(Path("flight_completed/config/objects.tsv"), "object")["close"]
+    assert row["photos"] == str(two_folders / "close") and row["prompts"] == str(two_folders / "clicks.tsv")
+    assert "Running on 2 cores; all that Snakemake says: flight_completed/results/logs/run.log" in said
+    assert "Time: about 3 min on 2 cores" in said and "Select jobs ..." not in said
+    assert any(line.endswith("close: masks; about 1 min left") for line in said)
+    assert said[-3:] == [
+        "Result: 1 of 1 objects completed",
+        "Report: flight_completed/results/summary/report.html",
+        "Next:   nothing is missing; open the result in CloudCompare or QGIS",
+    ]
+
+
+def test_the_same_command_goes_on_and_other_folders_are_another_project(two_folders, workflow, capsys):
+    workflow(SUMMARY)
+    run("close", prompts=(Path("clicks.tsv"),))
+    workflow("")
+    run("close")
+    assert "Going on with flight_completed" in capsys.readouterr().out
+    Project(two_folders).photos("shed")
+    with pytest.raises(StageError, match="flight_completed holds another project, whose objects are: close; give"):
+        run("close", "shed")
+
+
+def test_without_a_screen_an_object_without_clicks_is_one_sentence(two_folders, monkeypatch):
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: False)
+    with pytest.raises(
+        StageError, match="close has no clicks yet, and there is no screen to click on; give its clicks"
+    ):
+        run("close")
+    # The header alone, which the page leaves when a click is undone, is none.
+    (two_folders / "flight_completed/config/close_prompts.tsv").write_text(CLICKS.splitlines()[0])
+    with pytest.raises(StageError, match="close has no clicks yet"):
+        run("close")
+
+
+def test_masks_take_the_place_of_clicks(two_folders, workflow):
+    workflow(SUMMARY)
+    (two_folders / "drawn").mkdir()
+    run("close", masks=(Path("drawn"),))
+    assert read_table(Path("flight_completed/config/objects.tsv"), "object")["close"]["masks"]
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"prompts": (Path("clicks.tsv"), Path("clicks.tsv"))}, "--prompts names 2 for 1 objects; give one for each"),
+        ({"masks": (Path("nowhere"),)}, "nowhere does not exist; correct --masks"),
+        ({"out": Path("close")}, "the project close would lie among its photos in close"),
+    ],
+)
+def test_what_cannot_be_used_is_one_sentence(two_folders, options, sentence):
+    with pytest.raises(StageError, match=sentence):
+        run("close", **options)
+
+
+def test_a_folder_without_photos_is_one_sentence(two_folders):
+    (two_folders / "empty").mkdir()
+    with pytest.raises(StageError, match="the photo folder empty holds no photos"):
+        run("empty")
+
+
+@pytest.mark.parametrize(
+    ("said", "sentence"),
+    [
+        (
+            "failed: close: masks: too few clicks [x.log]\\nWorkflowError:\\nAt least one",
+            "^close: masks: too few clicks",
+        ),
+        ("WorkflowError in file x, line 3:\\nno rows", "^no rows; all that Snakemake says: flight_completed"),
+        ("error: the disk is full", "^the disk is full"),
+        ("", "^Snakemake ended early"),
+    ],
+)
+def test_a_run_that_fails_says_why_in_one_sentence(two_folders, workflow, said, sentence):
+    workflow(f"print('{said}'); raise SystemExit(1)")
+    with pytest.raises(StageError, match=sentence):
+        run("close", prompts=(Path("clicks.tsv"),))
+
+
+def test_an_interrupt_ends_snakemake_once_and_in_its_own_way(two_folders, workflow, monkeypatch):
+    workflow(
+        "import signal, pathlib, sys, time\n"
+        "signal.signal(signal.SIGINT, lambda *_: (pathlib.Path('ended').write_text('x'), sys.exit(1)))\n"
+        "print('Job 1: a', flush=True)\ntime.sleep(60)"
+    )
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(complete, "_report_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run("close", prompts=(Path("clicks.tsv"),))
+    assert Path("flight_completed/ended").read_text() == "x"
+
+
+def test_the_time_left_follows_what_jobs_took_so_far(tmp_path):
+    forecast = {f"{name}.tsv": 100.0 for name in "abcd"}
+    assert seconds_left(forecast, tmp_path, 0, 2) == pytest.approx(1.15 * 400 / 2)
+    for name in "ab":
+        (tmp_path / f"{name}.tsv").write_text("s\tcpu_time\n9\t300\n")
+    os.utime(tmp_path / "b.tsv", (50, 50))  # of a run before
+    # One of four is done and took three times its forecast, so that all takes half as long again.
+    assert seconds_left(forecast, tmp_path, 100, 2) == pytest.approx(1.15 * 1.5 * 300 / 2)
+
+
+def test_the_forecast_of_the_last_run_is_told_apart(tmp_path):
+    write_forecast(tmp_path / "f.tsv", {"a": 1.0})
+    write_forecast(tmp_path / "f.tsv", {"b": 2.0})
+    assert read_forecast(tmp_path / "f.tsv", of_last_run=True) == {"b": 2.0}
+
+
+def started(monkeypatch, *words: str) -> list[str]:
+    """The words that `scenefuse run` hands to Snakemake."""
+    given: list[list[str]] = []
+    monkeypatch.setattr(os, "execv", lambda _, command: given.append(command))
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "run", *words])
+    command_line.main()
+    return given[0][5:]
+
+
+def test_run_takes_all_cores_unless_somebody_says_how_many(two_folders, monkeypatch):
+    init(Path("yard"), scene=Path("flight"))
+    monkeypatch.chdir("yard")
+    own = ["--configfile", "config/config.yaml"]
+    assert started(monkeypatch, "-n") == ["-n", *own, "--cores", "all"]
+    for words in (["--cores", "3"], ["-c3"], ["--profile", "slurm"], ["--jobs=9"]):
+        assert started(monkeypatch, *words) == [*words, *own]
+
+
+def test_the_help_of_run_is_one_screen(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "run", "--help"])
+    command_line.main()
+    said = capsys.readouterr().out
+    assert "--cores N" in said and "python -m snakemake --help" in said and len(said.splitlines()) < 24
+
+
+def test_init_ends_with_the_next_command_by_its_real_names(two_folders, capsys):
+    init(Path("yard"), scene=Path("flight"), objects=(Path("close"),))
+    assert "next: cd yard && scenefuse pick --object close " in capsys.readouterr().out
+    assert "`scenefuse pick --object close`" in Path("yard/README.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("seed: 1\nobject:\n  nerf:\n    widht: 3\n", "line 4, object.nerf: unknown key 'widht'; did you mean 'width'"),
+        ("seed: 1\nobject: { nerf: { width: x } }\n", "line 2, object.nerf.width: 'x' is not of type 'integer'"),
+        ("registration:\n  variants: [full, 3]\n", "line 2, registration.variants.1: 3 is not of type"),
+        ("seed: 1\nobject: {\n", r" is no YAML \(line 3: expected the node content"),
+    ],
+)
+def test_an_error_in_settings_names_its_file_and_line(tmp_path, text, sentence):
+    (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(StageError, match=f"mine.yaml,? ?{sentence}".replace(",? ? is", " is")):
+        read_differences(tmp_path / "mine.yaml")
