@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from nicegui import ui
+from nicegui import app, ui
 
 from scenefuse.core.stage import StageError
 from scenefuse.pick.document import Document
@@ -48,6 +48,7 @@ KEYS = {
     "t": "next table",
 }
 POLL_S = 1.0
+FAREWELL = "The clicks are saved, and this page has ended. What comes next is in the terminal."
 
 
 class Page:
@@ -93,7 +94,7 @@ class Page:
                     lambda x, y: self._act(lambda: self._open.remove(x, y, self._map.reach_px())),
                     lambda corners: self._act(lambda: self._open.draw_box(corners)),
                 )
-            self._panel = SidePanel(session, self._act, self._open_photo)
+            self._panel = SidePanel(session, self._act, self._open_photo, self._end)
         self._layers = MaskLayers(session, self._map, lambda: self._panel.show_note(self._layers))
         with ui.dialog() as self._help, ui.card():
             ui.label("Keys and mouse").classes("text-base font-bold")
@@ -125,7 +126,7 @@ class Page:
         table, session = self._open.table, self._session
         self._open.picture = picture
         number = list(table.pictures).index(picture.name)
-        tiles = f"/tile/{session.tables.index(table)}/{number}/{{z}}/{{x}}/{{y}}?v={session.key}"
+        tiles = f"/tile/{session.tables.index(table)}/{number}/{{z}}/{{x}}/{{y}}?key={session.key}"
         self._map.show(picture, tiles)
         self._layers.forget()
         self._strip.mark(picture)
@@ -136,6 +137,11 @@ class Page:
         self._refresh()
 
     # What a person does
+
+    async def _end(self) -> None:
+        """End the page and its server; all clicks are saved already."""
+        await ui.run_javascript("document.body.innerText = given; return true;".replace("given", repr(FAREWELL)))
+        app.shutdown()
 
     def _act(self, action: Callable[[], None]) -> None:
         """Do what a person wants, or say why it cannot be done; and show what has changed."""

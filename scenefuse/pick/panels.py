@@ -44,7 +44,7 @@ class PhotoStrip:
         numbers = {name: number for number, name in enumerate(pictures)}
         with self._list:
             for picture in self.order:
-                self._add(picture, f"/thumbnail/{table}/{numbers[picture.name]}?v={self._session.key}")
+                self._add(picture, f"/thumbnail/{table}/{numbers[picture.name]}?key={self._session.key}")
         self._left = self._session.thumbnails_left(table)
 
     def _add(self, picture: Picture, source: str) -> None:
@@ -103,15 +103,16 @@ class PhotoStrip:
 class SidePanel:
     """What is beside the photo; filled anew after every change."""
 
-    def __init__(self, session: Session, act: Act, on_open: Callable[[Picture], None]) -> None:
+    def __init__(self, session: Session, act: Act, on_open: Callable[[Picture], None], on_done: Callable) -> None:
         """Build the panel inside the current element, empty.
 
         Args:
             session: the object.
             act: does what a person wants, and shows what changed or why it cannot be done.
             on_open: shows a photo.
+            on_done: ends the page.
         """
-        self._session, self._act, self._on_open = session, act, on_open
+        self._session, self._act, self._on_open, self._on_done = session, act, on_open, on_done
         self._column = ui.column().classes("side h-full no-wrap")
         with self._column:
             self._note = ui.label()
@@ -197,4 +198,8 @@ class SidePanel:
         if document.rows and not table.listed:
             text = f"Write {document.path} into the column {table.column} of the table of {table.of}."
             ui.label(text).classes("text-xs text-orange-900")
+        ui.button("Done", on_click=self._on_done).props("dense unelevated").classes("w-full")
+        ui.label("ends the page. Then scenefuse complete goes on by itself; in a terminal of the project:").classes(
+            "text-xs"
+        )
         ui.label(next_command(self._session.configfiles, table.result)).classes("code w-full").mark("command")

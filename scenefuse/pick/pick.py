@@ -1,19 +1,22 @@
 """The command that opens the page, and its local server: who may ask, and which pictures it serves."""
 
+import os
 import secrets
 import socket
 import threading
 import webbrowser
-from http.cookies import CookieError, SimpleCookie
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+import nicegui
 import tyro
 from fastapi import FastAPI, HTTPException
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
 from nicegui import app, ui
 
+from scenefuse.core.machine import has_screen
 from scenefuse.core.stage import StageError
 from scenefuse.pick.page import Page
 from scenefuse.pick.session import Session
@@ -21,45 +24,81 @@ from scenefuse.pick.session import Session
 HOST = "127.0.0.1"
 
 
+# The page that everybody gets. It trades the token after # for the secret, which stays in this tab of this port, and
+# gets the page that holds photos by it.
+DOOR = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><title>scenefuse</title><body><script>
+const token = location.hash.slice(1), ask = (path, method, secret) =>
+  fetch(path, {method, cache: "no-store", headers: {"x-scenefuse": secret}});
+history.replaceState(null, "", "/");
+(async () => {
+  const known = sessionStorage.getItem("scenefuse");
+  let page = known && await ask("/", "GET", known);
+  if (!page?.ok && token) {
+    const entered = await ask("/enter", "POST", token);
+    if (entered.ok) {
+      sessionStorage.setItem("scenefuse", await entered.text());
+      page = await ask("/", "GET", sessionStorage.getItem("scenefuse"));
+    }
+  }
+  if (page?.ok) { const text = await page.text(); document.open(); document.write(text); document.close(); }
+  else document.body.innerText = "Open this page by what scenefuse pick printed last.";
+})();
+</script>"""
+SAFETY = {
+    "content-security-policy": "frame-ancestors 'none'",
+    "x-frame-options": "DENY",
+    "cross-origin-opener-policy": "same-origin",
+    "referrer-policy": "no-referrer",
+}
+
+
 def pick(
-    *, object: str, configfile: tuple[Path, ...] = (), port: int = 0, no_browser: tyro.conf.UseCounterAction[int] = 0
+    *,
+    object: str | None = None,
+    configfile: tuple[Path, ...] = (),
+    port: int = 0,
+    no_browser: tyro.conf.UseCounterAction[int] = 0,
 ) -> None:
     """Click what an object is in its photos, and points in its scene's, in a page of this machine's browser.
 
     The page writes the tables that the workflow reads: columns `prompts` and `fiducials` of the table of objects, and
-    `lengths` of the table of scenes. Run it in the working directory of the workflow, with the same settings
-    files; Ctrl-C ends it.
+    `lengths` of the table of scenes. Run it in the folder of the project; its button Done or Ctrl-C ends it.
 
     Args:
-        object: name of the object, as in the table of objects.
+        object: name of the object, as in the table of objects; where it is left out, the only one.
         configfile: settings, one file or several, as given to snakemake; where it is left out, the shipped ones, or
             with the command `scenefuse pick` the project's config/config.yaml.
         port: of the page on this machine; 0 takes a free one.
-        no_browser: print the address only.
+        no_browser: print an address to open, which opens the page once.
 
     Raises:
         StageError: settings, tables or photos are wrong, or the port cannot be used.
     """
     session = Session(object, configfile)
-    port, token = _free_port(port), secrets.token_urlsafe(16)
-    address = f"http://{HOST}:{port}/?token={token}"
-    app.add_middleware(Guard, token=token, port=port)
+    port, shows = _free_port(port), has_screen() and not no_browser
+    entrance = Entrance(port, Path("results/pick/open.html"), print if not shows else lambda _: None)
+    app.add_middleware(Guard, entrance=entrance, key=session.key, port=port)
+    app.config.socket_io_js_query_params["key"] = session.key
     add_pictures(app, session)
 
-    @ui.page("/", title=f"{object}: click")
+    @ui.page("/", title=f"{session.name}: click")
     async def page() -> None:
         opened = Page(session)
         await ui.context.client.connected()
         await opened.begin()
 
     def announce() -> None:
-        print(f"{address}\nOpen this address in a browser of this machine; Ctrl-C ends the page.", flush=True)
-        if not no_browser:
-            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+        if shows:
+            print(f"The page opens in a browser, or by {entrance.file}; Done or Ctrl-C ends it.", flush=True)
+            threading.Thread(target=webbrowser.open, args=(entrance.file.resolve().as_uri(),), daemon=True).start()
+        else:
+            print(f"{entrance.address}\nOpen this address in a browser of this machine, or of one from which", end=" ")
+            print(f"ssh -L {port}:{HOST}:{port} leads here; Done or Ctrl-C ends the page.", flush=True)
 
     app.on_startup(session.start)
     app.on_startup(announce)
     app.on_shutdown(session.close)
+    app.on_shutdown(entrance.close)
     try:
         ui.run(
             host=HOST,
@@ -74,6 +113,7 @@ def pick(
     except SystemExit as end:
         session.leave(end.code if isinstance(end.code, int) else 1)
         raise
+    session.leave(0)
 
 
 def _free_port(wanted: int) -> int:
@@ -90,16 +130,53 @@ def _free_port(wanted: int) -> int:
         return probe.getsockname()[1]
 
 
-class Guard:
-    """Lets through requests of this machine's browser that know the token: in the address, then by a cookie.
+class Entrance:
+    """The way to the page: a token that leads in once, in a file that only this user can read; then comes another one.
 
-    A request has to be addressed to this machine, so that no other site's name can be made to point here, and a
-    websocket has to come from the page itself. An ASGI middleware.
+    Attributes:
+        secret: what the token is traded for.
+        address: with the token, after #: no browser sends it to a server, and the page takes it away at once.
+        file: an HTML page that leads to the address.
     """
 
-    def __init__(self, app: Any, token: str, port: int) -> None:
-        self._app, self._token, self._cookie = app, token, f"scenefuse_pick_{port}"
+    def __init__(self, port: int, file: Path, on_new: Callable[[str], Any]) -> None:
+        """Write the file; `on_new` gets each further address."""
+        self.secret, self.file, self._port, self._on_new = secrets.token_urlsafe(), file, port, on_new
+        self._renew()
+
+    def enter(self, token: str) -> str | None:
+        """The secret for the token, once; None for anything else."""
+        if not _same(token, self._token):
+            return None
+        self._renew()
+        self._on_new(f"To open the page again: {self.address}")
+        return self.secret
+
+    def close(self) -> None:
+        """Remove the file."""
+        self.file.unlink(missing_ok=True)
+
+    def _renew(self) -> None:
+        self._token = secrets.token_urlsafe()
+        self.address = f"http://{HOST}:{self._port}/#{self._token}"
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        self.file.unlink(missing_ok=True)
+        with open(os.open(self.file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={self.address}">')
+
+
+class Guard:
+    """Serves the page to who has the secret, photos and the websocket to who has the page's key. An ASGI middleware.
+
+    There is no cookie: browsers send those to every port of this machine, other users' servers included. A request has
+    to be addressed to this machine, so that no other site's name can be made to point here.
+    """
+
+    def __init__(self, app: Any, entrance: Entrance, key: str, port: int) -> None:
+        self._app, self._entrance, self._key = app, entrance, key
         self._hosts = {f"{HOST}:{port}", f"localhost:{port}"}
+        # NiceGUI's own scripts, the same for everybody.
+        self._public = f"/_nicegui/{nicegui.__version__}/"
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """Serve a request, or refuse it with 403."""
@@ -107,44 +184,41 @@ class Guard:
             await self._app(scope, receive, send)
             return
         headers = {key.decode("latin-1"): value.decode("latin-1") for key, value in scope["headers"]}
-        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        by_address = scope["type"] == "http" and self._is_token(given)
-        if not self._is_local(headers) or not (by_address or self._is_token(self._in_cookie(headers))):
-            await _refuse(scope, send)
-            return
+        answer = self._answer(scope, headers) if self._is_local(headers) else REFUSED
 
-        async def send_with_cookie(message: Any) -> None:
-            if by_address and message["type"] == "http.response.start":
-                value = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict"
-                message["headers"] = [*message["headers"], (b"set-cookie", value.encode())]
+        async def send_safely(message: Any) -> None:
             if message["type"] == "http.response.start":
-                message["headers"] = [*message["headers"], (b"referrer-policy", b"no-referrer")]
+                message["headers"] = [*message["headers"], *((k.encode(), v.encode()) for k, v in SAFETY.items())]
             await send(message)
 
-        await self._app(scope, receive, send_with_cookie)
+        if answer is not None and scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            await (answer or self._app)(scope, receive, send_safely)
+
+    def _answer(self, scope: Any, headers: dict[str, str]) -> Response | None:
+        """What a request gets from the guard; None where it may pass."""
+        path, given = scope["path"], headers.get("x-scenefuse", "")
+        if scope["type"] == "http" and path == "/enter":
+            secret = self._entrance.enter(given)
+            return REFUSED if secret is None else PlainTextResponse(secret, headers={"cache-control": "no-store"})
+        if path == "/" and not given:
+            return HTMLResponse(DOOR, headers={"cache-control": "no-store"})
+        if path == "/":
+            return None if _same(given, self._entrance.secret) else REFUSED
+        key = parse_qs(scope["query_string"].decode("latin-1")).get("key", [""])[0]
+        return None if path.startswith(self._public) or _same(key, self._key) else REFUSED
 
     def _is_local(self, headers: dict[str, str]) -> bool:
         origin = headers.get("origin")
         return headers.get("host") in self._hosts and (origin is None or urlsplit(origin).netloc in self._hosts)
 
-    def _is_token(self, text: str) -> bool:
-        return secrets.compare_digest(text.encode(), self._token.encode())
 
-    def _in_cookie(self, headers: dict[str, str]) -> str:
-        try:
-            found = SimpleCookie(headers.get("cookie", "")).get(self._cookie)
-        except CookieError:
-            return ""
-        return found.value if found else ""
+REFUSED = PlainTextResponse("Open the page by what scenefuse pick printed last.", 403)
 
 
-async def _refuse(scope: Any, send: Any) -> None:
-    if scope["type"] == "websocket":
-        await send({"type": "websocket.close", "code": 1008})
-        return
-    text = b"Open the address that scenefuse pick printed: it ends with the token."
-    await send({"type": "http.response.start", "status": 403, "headers": [(b"content-type", b"text/plain")]})
-    await send({"type": "http.response.body", "body": text})
+def _same(given: str, secret: str) -> bool:
+    return secrets.compare_digest(given.encode(), secret.encode())
 
 
 def add_pictures(app: FastAPI, session: Session) -> None:

@@ -37,16 +37,19 @@ class Session:
         masks: of the object, as the workflow has them.
         results_state: changes with what the workflow has written.
         wanted: photos that are clicked next, whose features are computed ahead.
-        key: of this session, for addresses of pictures that the browser may keep.
+        key: that the page's requests for pictures and its websocket carry.
     """
 
-    def __init__(self, name: str, configfiles: tuple[Path, ...]) -> None:
-        """Read the project, the tables and the photos' headers.
+    def __init__(self, name: str | None, configfiles: tuple[Path, ...]) -> None:
+        """Read the project, the tables and the photos' headers; without a name, of its only object.
 
         Raises:
             StageError: settings, tables or photos are wrong.
         """
         project = read_project(read_settings(*configfiles))
+        if name is None and len(project.objects) != 1:
+            raise StageError(f"say by --object which one of {', '.join(project.objects) or 'none'} you want to click")
+        name = name or next(iter(project.objects))
         self.name, self.configfiles = name, configfiles
         self.tables = tables_of(project, name)
         self.tiles, self.thumbnails = Tiles(), Thumbnails(Path("results/pick/thumbnails"))
@@ -55,7 +58,7 @@ class Session:
         self.results_state: tuple[float, ...] = ()
         self.read_results()
         self.wanted: list[Picture] = []
-        self.key = secrets.token_hex(4)
+        self.key = secrets.token_urlsafe()
         self._closed = False
         # A download or a network at work does not keep the page from ending.
         self._network = threading.Thread(target=self.segmenter.compute_ahead, args=(lambda: self.wanted,), daemon=True)
@@ -187,4 +190,4 @@ def next_command(configfiles: tuple[Path, ...], target: Path) -> str:
     """The command line that makes a file of the results, as a person types it in the working directory."""
     # `scenefuse run` reads the project's own settings by itself.
     given = ["--configfile", *map(str, configfiles)] if configfiles not in ((), (OWN_SETTINGS,)) else []
-    return shlex.join(["scenefuse", "run", *given, "--cores", "2", str(target)])
+    return shlex.join(["scenefuse", "run", *given, str(target)])

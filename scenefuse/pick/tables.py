@@ -180,7 +180,7 @@ def _video_pictures(video: Path, results: Path) -> dict[str, Picture]:
     """The frames that were extracted. They may be smaller than the video's, whose pixels clicks are in."""
     listed = results / "photos.json"
     if not listed.is_file():
-        raise StageError(f"{video} is a video whose frames are not there yet; run: snakemake --cores 2 {listed}")
+        raise StageError(f"{video} is a video whose frames are not there yet; run: scenefuse run {listed}")
     found = {}
     for name, origin in read_json(listed)["origin"]["value"].items():
         path = results / "frames" / name

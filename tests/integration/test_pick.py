@@ -46,9 +46,19 @@ def yard(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def address(yard):
-    with served(yard.path) as (address, _):
-        yield address
+def running(yard):
+    with served(yard.path) as running:
+        yield running
+
+
+@pytest.fixture
+def address(running):
+    return running[0]
+
+
+@pytest.fixture
+def server(running):
+    return running[1]
 
 
 @pytest.fixture
@@ -74,7 +84,39 @@ def test_clicks_give_a_mask_and_are_saved_where_they_were_made(page):
     assert np.abs(marked.pixels - [*DISC, (550, 350)]).max() < 1
     assert page.browser.complaints() == []
     asked = {re.split(r"(?<!/)/(?!/)", url)[0] for url in page.browser.requests() if not url.startswith("data:")}
-    assert asked == {page.address.split("/?")[0]}
+    assert asked == {page.address.split("/#")[0]}
+
+
+def test_no_secret_is_in_the_address_bar_a_cookie_or_the_list_of_processes(page, address, server):
+    assert page.browser.value("return [location.href, document.cookie];") == [address.split("#")[0], ""]
+    assert page.browser.window.get_cookies() == []
+    page.browser.window.refresh()  # the tab may read the page again
+    page.until("return !!document.querySelector('.leaflet-tile-loaded');")
+    assert address.split("#")[1] not in Path(f"/proc/{server.pid}/cmdline").read_text()
+
+
+def test_another_tab_gets_nothing_by_an_address_that_was_used(page, address, browser):
+    first = browser.window.current_window_handle
+    browser.window.switch_to.new_window("tab")
+    try:
+        browser.window.get(address)
+        page.until_text("Open this page by what scenefuse pick printed last.")
+    finally:
+        browser.window.close()
+        browser.window.switch_to.window(first)
+        browser.complaints()
+
+
+def test_the_button_done_ends_the_page_and_its_server(yard, browser):
+    for name in ("prompts.tsv", "clicks.tsv", "yard_lengths.tsv"):
+        (yard.path / name).unlink(missing_ok=True)
+    with served(yard.path) as (address, server):
+        page = Page(browser, yard.path / "prompts.tsv", address, SIZE)
+        page.button("Done")
+        page.until_text("The clicks are saved, and this page has ended.")
+        server.join(30)
+        assert server.exitcode == 0
+    assert not list(yard.path.glob("results/pick/*.html"))
 
 
 def test_the_mask_covers_the_disc(page):

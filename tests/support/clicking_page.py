@@ -31,7 +31,7 @@ def served(folder, name="shed", config="mine.yaml"):
     child.close()
     try:
         text = ""
-        while not (found := re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", text)):
+        while not (found := re.search(r"http://127\.0\.0\.1:\d+/#\S+", text)):
             part = os.read(printed.fileno(), 4096).decode()
             assert part, text
             text += part
@@ -63,6 +63,7 @@ class Page:
 
     def open(self):
         self.browser.complaints()
+        self.browser.window.get("about:blank")
         self.browser.window.get(self.address)
         self.until("return !!document.querySelector('.leaflet-tile-loaded');")
 

@@ -115,7 +115,7 @@ def test_photos_have_the_names_that_the_workflow_gives_them(yard):
 def test_frames_of_a_video_are_clicked_in_the_video_s_pixels(yard):
     (yard.path / "walk.mp4").write_bytes(b"video")
     yard.objects = HEADER + "shed\tyard\twalk.mp4\t\tprompts.tsv\t\t\n"
-    with pytest.raises(StageError, match="snakemake --cores 2 results/objects/shed/photos.json"):
+    with pytest.raises(StageError, match="scenefuse run results/objects/shed/photos.json"):
         opened(yard)
     frames = yard.path / "results/objects/shed/frames"
     frames.mkdir(parents=True)
@@ -209,6 +209,6 @@ def test_weights_that_cannot_be_fetched_leave_nothing_behind_and_the_page_says_s
 def test_the_next_command_is_the_one_to_type():
     target = Path("results/objects/shed/masks.png")
     for own in ((), (Path("config/config.yaml"),)):
-        assert next_command(own, target) == "scenefuse run --cores 2 results/objects/shed/masks.png"
+        assert next_command(own, target) == "scenefuse run results/objects/shed/masks.png"
     given = next_command((Path("/a/my settings.yaml"), Path("few.yaml")), target)
-    assert given.startswith("scenefuse run --configfile '/a/my settings.yaml' few.yaml --cores 2 results/")
+    assert given.startswith("scenefuse run --configfile '/a/my settings.yaml' few.yaml results/")
