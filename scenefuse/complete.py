@@ -183,7 +183,7 @@ def _run_workflow(project: Path, targets: list[str], cores: int | None) -> None:
                     process.wait(timeout=1)
                     ended = True
                 for line in read:
-                    _report_step(project, line.rstrip(), started, cores)
+                    report_step(project, line.rstrip(), started, cores)
         except BaseException:
             process.send_signal(signal.SIGINT)
             process.wait()
@@ -195,8 +195,8 @@ def _run_workflow(project: Path, targets: list[str], cores: int | None) -> None:
         raise StageError(f"{_why(lines)}; all that Snakemake says: {log}")
 
 
-def _report_step(project: Path, line: str, started: float, cores: int) -> None:
-    """Print a line of the log, if it says what a run will take or that a job starts; with the time left."""
+def report_step(project: Path, line: str, started: float, cores: int) -> None:
+    """Print a line of a run's log, if it says what a run will take or that a job starts; with the time left."""
     job = JOB.fullmatch(line)
     if FORECAST_LINE.fullmatch(line):
         print(line[0].upper() + line[1:], flush=True)

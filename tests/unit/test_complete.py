@@ -145,7 +145,7 @@ def test_an_interrupt_ends_snakemake_once_and_in_its_own_way(two_folders, workfl
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(complete, "_report_step", interrupted)
+    monkeypatch.setattr(complete, "report_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run("close", prompts=(Path("clicks.tsv"),))
     assert Path("flight_completed/ended").read_text() == "x"
