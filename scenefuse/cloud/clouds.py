@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +66,7 @@ class Cloud:
         normals = None if self.normals is None else b_from_a.rotate(self.normals).astype(np.float32)
         return replace(self, points=b_from_a.apply(self.points), normals=normals)
 
-    @property
+    @cached_property
     def diagonal(self) -> float:
         """Length of the axis-aligned bounding box's diagonal."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self) else 0.0

@@ -1,17 +1,17 @@
 """Registration of two clouds in memory: a decision and a transform, by the steps of the workflow."""
 
+import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from scenefuse.cloud.cloud_file import EVERYWHERE
-from scenefuse.cloud.clouds import Cloud, has_unit_normals, occupied_voxels, read_cloud, sampled
+from scenefuse.cloud.clouds import Cloud, has_unit_normals, read_cloud, sampled_rows
 from scenefuse.cloud.readers.text import TEXTS
 from scenefuse.core.settings import build, read_settings
-from scenefuse.core.stage import StageError, quantity, threads
+from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import UP, Array, Sim3
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import MIN_POINTS, around_marks, crop_marked
@@ -21,16 +21,15 @@ from scenefuse.register.agreement import AgreementSettings, registration_metrics
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.fine import pose_quantities
+from scenefuse.register.places import likely_places
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, estimates, prior
 from scenefuse.register.refinement import Outcome, refine_hypotheses
-from scenefuse.register.score import SCORE_FRACTION
 from scenefuse.register.uncertainty import uncertainty_quantities
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
 SEARCHED_POINTS = 500_000
-# Of `second_place`: what a found pose leaves of a scene, over the object, so that it may show it again; share of the
-# object that the coarse search finds there; distance of both places, over the object's diagonal.
-MIN_REST, MIN_PRECISION, MIN_DISTANCE = 0.3, 0.25, 0.4
+# Places this far from each other, over the object's diagonal, are different.
+MIN_DISTANCE = 0.4
 Direction = tuple[float, float, float]
 
 
@@ -119,6 +118,11 @@ class Registration:
     agreement: dict[str, dict[str, Any]]
     unit: str = "scene units"
 
+    @property
+    def total(self) -> float:
+        """The score that poses are ranked by; 0 where nothing gave a pose."""
+        return 0.0 if self.outcome is None else self.outcome.ranked[0].score.total
+
 
 def register_clouds(
     obj: Cloud,
@@ -144,12 +148,23 @@ def register_clouds(
     Raises:
         StageError: too few different points, or all in one place or along one line, on either side.
     """
+    return _compared(_registered(obj, scene, settings, seed, ups, scales, unit), obj, scene, settings, seed)
+
+
+def _registered(
+    obj: Cloud,
+    scene: Cloud,
+    settings: RegistrationSettings,
+    seed: int,
+    ups: tuple[Array, Array] | None,
+    scales: ScaleRange | None,
+    unit: str,
+) -> Registration:
+    """The registration without its agreement; see `register_clouds`."""
     for name, cloud in (("the object", obj), ("the scene", scene)):
         _check_points(cloud, name)
     origins = np.floor(obj.points.mean(0)), np.floor(scene.points.mean(0))
-    near_obj, near_scene = (
-        _searched(replace(cloud, points=cloud.points - origin), seed) for cloud, origin in zip((obj, scene), origins)
-    )
+    near_obj, near_scene = (_searched(cloud, at, seed) for cloud, at in zip((obj, scene), origins))
     if scales is None:
         scales = prior(estimates(near_obj, near_scene, ups), settings.scale)
     problem = Problem(near_obj, near_scene, scales, Constraints(ups), seed)
@@ -157,48 +172,86 @@ def register_clouds(
     if not found:
         return Registration(False, "neither features nor gravity gave a pose", None, None, origins, scales, {})
     outcome = refine_hypotheses(problem, [(hypothesis.pose, hypothesis.source) for hypothesis in found], settings.fine)
-    pose, diagonal = outcome.ranked[0].pose, near_scene.diagonal
-    tau = settings.agreement.tau_fraction * diagonal
-    agreement = registration_metrics(near_obj, near_scene, pose, tau, diagonal, unit)
-    whole = Sim3(1.0, np.eye(3), origins[1]) @ pose @ Sim3(1.0, np.eye(3), -origins[0])
-    return Registration(
-        outcome.decision.registered, outcome.decision.reason, whole, outcome, origins, scales, agreement, unit
-    )
+    whole = Sim3(1.0, np.eye(3), origins[1]) @ outcome.ranked[0].pose @ Sim3(1.0, np.eye(3), -origins[0])
+    return Registration(outcome.decision.registered, outcome.decision.reason, whole, outcome, origins, scales, {}, unit)
 
 
-def second_place(
-    found: Registration,
+def _compared(found: Registration, obj: Cloud, scene: Cloud, settings: RegistrationSettings, seed: int) -> Registration:
+    """A registration with how well both clouds agree at its pose."""
+    if found.outcome is None:
+        return found
+    near_obj, near_scene = (_searched(cloud, at, seed) for cloud, at in zip((obj, scene), found.origins))
+    tau, diagonal = settings.agreement.tau_fraction * near_scene.diagonal, near_scene.diagonal
+    pose = found.outcome.ranked[0].pose
+    return replace(found, agreement=registration_metrics(near_obj, near_scene, pose, tau, diagonal, found.unit))
+
+
+def find_in_scene(
     obj: Cloud,
     scene: Cloud,
     settings: RegistrationSettings,
     seed: int,
+    *,
     ups: tuple[Array, Array] | None = None,
-) -> Array | None:
-    """Where (3,) the scene shows an object again that was registered in it, or something of its shape; None if nowhere.
+    up_in_scene: Array | None = None,
+    scales: ScaleRange | None = None,
+    unit: str = "scene units",
+) -> tuple[Registration, Cloud, str]:
+    """Find where an object lies in a scene that may be thirty times as wide (method R16).
 
-    The object is registered once more, at the scale found, in what the found pose leaves unexplained, if that is large
-    enough, and the coarse search finds enough of the object there. Arguments as of `register_clouds`.
+    It is registered in the whole scene, as if that showed little else, and in each of `likely_places`. The best has to
+    lead over those elsewhere as over other poses.
+
+    Args:
+        obj, scene, settings, seed, ups, scales, unit: as of `register_clouds`.
+        up_in_scene: unit vector (3,), opposite to gravity; None where it is not known.
+
+    Returns:
+        The best registration, the part of the scene that it was found in, and what that is in words.
+
+    Raises:
+        StageError: as of `register_clouds`.
     """
-    pose = found.scene_from_object
-    if pose is None:
-        return None
-    moved = sampled(pose.apply(obj.points), SEARCHED_POINTS, seed)
-    centre, size = moved.mean(0), float(np.linalg.norm(np.ptp(moved, axis=0)))
-    own = sampled(scene.points, SEARCHED_POINTS, seed)
-    rest = own[cKDTree(moved).query(own, workers=threads())[0] > SCORE_FRACTION * scene.diagonal]
-    voxel = SCORE_FRACTION * size
-    if len(rest) < MIN_POINTS or occupied_voxels(rest, voxel) < MIN_REST * occupied_voxels(moved, voxel):
-        return None
-    known = Constraints(None if ups is None else (ups[1], ups[1]))
-    problem = Problem(Cloud(moved - centre), Cloud(rest - centre), ScaleRange(1.0, 0.0), known, seed)
-    there = find_hypotheses(problem, settings.coarse)
-    if not there or max(one.score.precision for one in there) < MIN_PRECISION:
-        return None
-    outcome = refine_hypotheses(problem, [(one.pose, one.source) for one in there], settings.fine)
-    place = outcome.ranked[0].pose.translation
-    if not outcome.decision.registered or np.linalg.norm(place) < MIN_DISTANCE * size:
-        return None
-    return np.asarray(place + centre)
+    tried = [(_registered(obj, scene, settings, seed, ups, scales, unit), scene)]
+    for rows in likely_places(obj, scene, up_in_scene, settings.crop, seed):
+        with contextlib.suppress(StageError):  # too few different points there
+            tried.append((_registered(obj, scene[rows], settings, seed, ups, scales, unit), scene[rows]))
+    found, part = max(tried, key=lambda one: (one[0].registered, one[0].total))
+    searched = f"the whole scene, {len(scene)} points"
+    if len(tried) > 1:
+        searched += f", and {len(tried) - 1} places in it that look like the object"
+        found = _unless_elsewhere(found, [other for other, _ in tried], obj, settings.fine)
+    return _compared(found, obj, part, settings, seed), part, searched
+
+
+def _unless_elsewhere(
+    found: Registration, others: list[Registration], obj: Cloud, settings: FineSettings
+) -> Registration:
+    """A registration, or a refusal where the object fits another place nearly as well."""
+    pose, outcome = found.scene_from_object, found.outcome
+    if pose is None or outcome is None:
+        return found
+    if not found.registered:
+        shown = outcome.ranked[0].score.precision
+        reason = f"the best place shows {shown:.0%} of the object, which may not be in this scene: {found.reason}"
+        return replace(found, reason=reason)
+    middle, size = obj.points.mean(0), pose.scale * obj.diagonal
+    elsewhere = [
+        other
+        for other in others
+        if other.scene_from_object is not None
+        and np.linalg.norm(other.scene_from_object.apply(middle) - pose.apply(middle)) > MIN_DISTANCE * size
+    ]
+    rival = max(elsewhere, key=lambda other: other.total, default=None)
+    if rival is None or rival.scene_from_object is None:
+        return found
+    margin = min(outcome.decision.margin, 1 - rival.total / max(found.total, 1e-12))
+    found = replace(found, outcome=replace(outcome, decision=replace(outcome.decision, margin=margin)))
+    if margin >= settings.min_margin:
+        return found
+    at = " ".join(f"{x:.10g}" for x in rival.scene_from_object.apply(middle))
+    reason = f"another place is nearly as good, at ({at}): the margin is {margin:.3f}, below {settings.min_margin:.3f}"
+    return replace(found, registered=False, reason=reason)
 
 
 def _check_points(cloud: Cloud, name: str) -> None:
@@ -250,7 +303,7 @@ def cut_scene(
             raise StageError("no scene point lies in the crop box; give least x y z, then greatest x y z")
         return part, f"the crop box, {len(part)} points in a scene of {total}"
     if fiducials is None:
-        return scene, f"the whole scene, {total} points, as if it showed little but the object"
+        return scene, f"the whole scene, {total} points"
     names, marks = _fiducials(fiducials)
     if up_in_scene is None:
         settings, up_in_scene = replace(settings, remove_ground=False), UP
@@ -344,10 +397,8 @@ def _fiducials(path: Path) -> tuple[list[str], Array]:
     return marked.points, marked.positions
 
 
-def _searched(cloud: Cloud, seed: int) -> Cloud:
-    """A cloud of not too many points, without normals that say nothing: they are estimated then."""
-    if not has_unit_normals(cloud):
-        cloud = replace(cloud, normals=None)
-    if len(cloud) <= SEARCHED_POINTS:
-        return cloud
-    return cloud[np.sort(np.random.default_rng(seed).permutation(len(cloud))[:SEARCHED_POINTS])]
+def _searched(cloud: Cloud, origin: Array, seed: int) -> Cloud:
+    """A cloud about an origin (3,), of not too many points, without normals that say nothing: they are estimated."""
+    cloud = cloud[np.sort(sampled_rows(len(cloud), SEARCHED_POINTS, seed))]
+    normals = cloud.normals if has_unit_normals(cloud) else None
+    return replace(cloud, points=cloud.points - origin, normals=normals)

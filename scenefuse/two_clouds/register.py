@@ -27,10 +27,10 @@ from scenefuse.register.register import (
     RegistrationSettings,
     cut_scene,
     evidence_of,
+    find_in_scene,
     register_clouds,
     report,
     search_box,
-    second_place,
     summary,
 )
 from scenefuse.two_clouds.complete import complete, fusion_settings, write_files
@@ -117,16 +117,14 @@ def register(
         _check_size(scales, given)
     crs = las_crs(scene)
     unit = "scene units" if crs is None else unit_and_name(crs)[0]
-    found = register_clouds(given.object, given.scene.part, settings, seed, ups=given.ups, scales=scales, unit=unit)
-    if found.registered and known.fiducials is None and known.crop_box is None:
-        again = second_place(found, given.object, given.scene.part, settings, seed, given.ups)
-        if again is not None:
-            at = " ".join(f"{x:.10g}" for x in again)
-            notes.append(
-                f"the scene shows the object, or something like it, a second time, at ({at}): if that is the one, mark"
-                " it with --fiducials or --crop-box"
-            )
-            print(f"note       {notes[-1]}", flush=True)
+    if known.fiducials is None and known.crop_box is None:
+        found, part, searched = find_in_scene(
+            given.object, given.scene.part, settings, seed, ups=given.ups, up_in_scene=known.ups()[1], scales=scales,
+            unit=unit,
+        )  # fmt: skip
+        given = replace(given, scene=replace(given.scene, part=part), searched=searched)
+    else:
+        found = register_clouds(given.object, given.scene.part, settings, seed, ups=given.ups, scales=scales, unit=unit)
     evidence = evidence_of(given.object, given.scene.part, given.ups)
     points = {"object_points": len(given.object), "scene_points": given.scene.summary.count}
     content = report(found, given.ups) | {

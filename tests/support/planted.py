@@ -1,7 +1,7 @@
 """Planted registration trials: an object in an unknown frame and scale against a partial, noisy scene."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -9,7 +9,7 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from scenefuse.cloud.clouds import Cloud
+from scenefuse.cloud.clouds import Cloud, concatenate
 from scenefuse.core.transforms import Sim3, rotation_angle_deg, rotation_between
 from scenefuse.demo import objects
 from scenefuse.demo.objects import Part, blob, box, grid, join, lathe, tube
@@ -272,6 +272,64 @@ def plant(
         diagonal,
         np.array([0.0, 0.0, 1.0]) if shape.round and shape.plain else None,
     )
+
+
+def plant_wide(name, seed, times, *, absent=False, ground_points=300_000, slope=0.0, noise=0.005, **given):
+    """A trial in a landscape `times` as wide as the object: hills, two other objects, bushes, boulders.
+
+    Args:
+        name, seed, slope, noise, given: as of `plant`.
+        times: width of the landscape over the object's.
+        absent: whether another object stands where this one would.
+        ground_points: of the landscape at most.
+    """
+    rng, names = np.random.default_rng([seed, times, *name.encode()]), list(SHAPES)
+    others = [names[(names.index(name) + k) % len(names)] for k in rng.permutation(np.arange(1, len(names)))[:3]]
+    trial = plant(name, seed, ground=False, noise=noise, depth_maps=False, **given)
+    shown = plant(others[2], seed, ground=False, noise=noise, depth_maps=False, **given) if absent else trial
+    diagonal, per_area = trial.diagonal, len(shown.scene) / shown.diagonal**2
+    width = times * float(np.ptp(trial.scene_from_object.apply(trial.object.points)[:, :2], axis=0).max())
+    centre, hills = rng.uniform(-0.3, 0.3, 2) * width, int(rng.integers(1000))
+
+    def height(xy):
+        flat = np.c_[xy, 0 * xy[:, 0]]
+        rolling = 0.02 * diagonal * _noise(flat / diagonal, hills, 4.0) + 0.02 * width * _noise(
+            flat / width, hills, 4.0
+        )
+        return slope * xy[:, 0] + rolling
+
+    def placed(cloud, at, scale=1.0):
+        foot = np.array([*at, float(height(at[None])[0] - height(np.zeros((1, 2)))[0])])
+        turn = Rotation.from_rotvec([0, 0, 0 if scale == 1.0 else rng.uniform(0, 6)]).as_matrix()
+        return cloud.transformed(Sim3(scale, turn, foot))
+
+    clouds = [shown.scene]
+    for other, angle in zip(others[:2], rng.uniform(0, np.pi) + np.array([0, np.pi * 0.8])):
+        cloud = plant(other, seed + 1, ground=False, noise=noise, depth_maps=False, **given)
+        scale = diagonal / cloud.diagonal * float(np.exp(rng.uniform(-0.5, 0.3)))
+        reach = max(1.3 * diagonal, rng.uniform(0.1, 0.3) * width)
+        clouds.append(placed(cloud.scene, reach * np.array([np.cos(angle), np.sin(angle)]), scale))
+    for k in range(6 * times):
+        size = rng.uniform(0.05, 0.2) * diagonal
+        at = rng.uniform(-0.5, 0.5, 2) * width - centre
+        if np.linalg.norm(at) < 0.7 * diagonal + size:
+            continue
+        thing = blob((size, size, rng.uniform(0.6, 1.4) * size), 0.3, 3, int(rng.integers(1000)), 0)
+        hue = (0.2, 0.35, 0.12) if k % 3 else (0.45, 0.43, 0.4)
+        points, normals, colors = _sampled(thing, int(max(100, 0.7 * per_area * _area(thing))), hue, rng)
+        up = points[:, 2] > -0.3 * size
+        points += rng.normal(0, noise * diagonal, points.shape)
+        clouds.append(placed(Cloud(points[up], normals[up].astype(np.float32), _bytes(colors[up])), at))
+    count = min(ground_points, int(0.7 * per_area * width**2))
+    xy = rng.uniform(-0.5, 0.5, (count, 2)) * width - centre
+    step = 1e-3 * width
+    slopes = [(height(xy + d) - height(xy - d)) / (2 * step) for d in (np.array([step, 0]), np.array([0, step]))]
+    normals = np.stack([-slopes[0], -slopes[1], np.ones(count)], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = np.c_[xy, height(xy) - height(np.zeros((1, 2)))] + rng.normal(0, noise * diagonal, (count, 3))
+    shade = 0.5 + _noise(points / diagonal, hills + 1, 3.0)[:, None]
+    clouds.append(Cloud(points, normals.astype(np.float32), _bytes(np.array([0.35, 0.42, 0.2]) * shade)))
+    return replace(trial, scene=concatenate(clouds), coverage=0.0 if absent else trial.coverage)
 
 
 def _bytes(colors):

@@ -22,10 +22,9 @@ from scenefuse.core.stage import StageError, quantity, read_json, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.core.version import VERSION
 from scenefuse.fuse.modes import FusionSettings
-from scenefuse.geometry.icp import ScaleRange
 from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.register import Registration, RegistrationSettings, second_place
+from scenefuse.register.register import RegistrationSettings
 from scenefuse.two_clouds.complete import append_to_las, complete, write_files
 from scenefuse.two_clouds.page import write_page
 from scenefuse.two_clouds.register import register
@@ -480,41 +479,6 @@ def test_strays_and_normals_that_say_nothing_do_not_count(tmp_path, house, monke
     notes = " ".join(value(content, "notes"))
     assert "2 points of" in notes and "1 points of what is searched" in notes and "not all of unit length" in notes
     assert value(content, "inputs")["object_points"] == len(house.object)
-
-
-def where_again(house, beside):
-    """What `second_place` says of a scene in which the house stands where it does, and something beside it."""
-    pose = house.scene_from_object
-    found = Registration(True, "", pose, None, (np.zeros(3), np.zeros(3)), ScaleRange(pose.scale, 0.0), {})
-    scene = Cloud(np.concatenate([house.scene.points, beside]))
-    return second_place(found, house.object, scene, LITTLE, 0)
-
-
-def test_an_object_that_a_scene_shows_twice_is_found_a_second_time(house):
-    moved = house.scene_from_object.apply(house.object.points)
-    off = np.array([1.3 * house.diagonal, 0, 0])
-    place = where_again(house, moved + off)
-    assert np.linalg.norm(place - moved.mean(0) - off) < 0.05 * house.diagonal
-
-
-def test_what_stands_beside_an_object_is_not_a_second_one(house):
-    moved = house.scene_from_object.apply(house.object.points)
-    rng, low, size = np.random.default_rng(0), moved.min(0), house.diagonal
-    ground = np.column_stack([rng.uniform(-size, size, (8000, 2)) + moved.mean(0)[:2], np.full(8000, low[2])])
-    ball = rng.normal(size=(4000, 3))
-    ball = ball / np.linalg.norm(ball, axis=1, keepdims=True) * 0.3 * size + moved.mean(0) + [size, 0, 0]
-    for beside in (np.zeros((0, 3)), ground, ball):
-        assert where_again(house, beside) is None
-
-
-def test_a_second_place_is_told_in_a_note(tmp_path, house, monkeypatch, capsys):
-    registered_at_once(monkeypatch, house.scene_from_object)
-    monkeypatch.setattr("scenefuse.two_clouds.register.second_place", lambda *known: np.array([20.0, -3, 5.25]))
-    write_cloud(tmp_path / "house.ply", house.object)
-    write_cloud(tmp_path / "yard.ply", house.scene)
-    assert register(object=tmp_path / "house.ply", scene=tmp_path / "yard.ply", out=tmp_path / "out") == 0
-    said = [note for note in value(read_json(tmp_path / "out/transform.json"), "notes") if "a second time" in note]
-    assert len(said) == 1 and "at (20 -3 5.25): if that is the one" in said[0] and said[0] in capsys.readouterr().out
 
 
 def test_a_las_of_an_old_version_is_completed(tmp_path):

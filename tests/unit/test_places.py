@@ -1,0 +1,112 @@
+"""An object in a landscape much wider than itself: where it may stand, and which of several places is taken."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.planted import plant_wide
+
+from scenefuse.core.transforms import UP, Sim3
+from scenefuse.crop.crop_cloud import CropSettings
+from scenefuse.geometry.icp import ScaleRange
+from scenefuse.register import register
+from scenefuse.register.coarse import CoarseSettings
+from scenefuse.register.decision import Decision, FineSettings
+from scenefuse.register.places import likely_places
+from scenefuse.register.refinement import Outcome
+from scenefuse.register.register import Registration, RegistrationSettings, find_in_scene
+from scenefuse.register.score import Hypothesis, Score
+
+LITTLE = RegistrationSettings(
+    coarse=CoarseSettings(ransac_samples=10000, candidates=8, keep=3),
+    fine=FineSettings(voxel_fraction=0.012, turn_steps=8),
+)
+
+
+@pytest.fixture(scope="module")
+def yard():
+    """A house in a landscape ten times as wide, on a slope."""
+    return plant_wide("house", 3, 10, object_points=6000, density_ratio=0.5, slope=0.05, ground_points=40_000)
+
+
+def place_of(trial):
+    return trial.scene_from_object.apply(trial.object.points).mean(0)
+
+
+def test_one_of_the_likely_places_is_the_object_without_its_ground(yard):
+    def off(rows):
+        return np.linalg.norm(np.median(yard.scene.points[rows], axis=0) - place_of(yard))
+
+    nearest = min(likely_places(yard.object, yard.scene, UP, CropSettings(), 0), key=off)
+    assert off(nearest) < 0.2 * yard.diagonal
+    assert np.linalg.norm(np.ptp(yard.scene.points[nearest], axis=0)) < 1.3 * yard.diagonal
+
+
+def test_a_house_is_found_in_a_landscape_ten_times_as_wide(yard, monkeypatch):
+    monkeypatch.setattr("scenefuse.register.places.MAX_PLACES", 2)
+    found, part, searched = find_in_scene(yard.object, yard.scene, LITTLE, 0, up_in_scene=UP)
+    assert found.registered, found.reason
+    assert np.linalg.norm(found.scene_from_object.apply(yard.object.points).mean(0) - place_of(yard)) < (
+        0.02 * yard.diagonal
+    )
+    assert abs(found.scene_from_object.scale / yard.scene_from_object.scale - 1) < 0.02
+    assert len(part) < 0.2 * len(yard.scene) and "places in it" in searched
+
+
+def tried(total, at, registered=True, precision=0.7):
+    """A registration of a certain score at a place."""
+    score = Score(total, precision, 0.8, None, None, total)
+    best = Hypothesis(Sim3(1.0, np.eye(3), np.array(at, float)), "features", score)
+    decision = Decision(registered, "its own reason", "geometry", 0.5, None, None)
+    origins = np.zeros(3), np.zeros(3)
+    return Registration(
+        registered, decision.reason, best.pose, Outcome([best], decision, None), origins, ScaleRange(1.0, 0.5), {}
+    )
+
+
+def chosen(monkeypatch, yard, *there):
+    """What is chosen of registrations in the whole scene and at places."""
+    there = iter(there)
+    monkeypatch.setattr(register, "_registered", lambda *known: next(there))
+    monkeypatch.setattr(register, "_compared", lambda found, *known: found)
+    monkeypatch.setattr(register, "likely_places", lambda *known: [np.arange(300), np.arange(300, 600)])
+    return find_in_scene(yard.object, yard.scene, LITTLE, 0)[0]
+
+
+def test_the_best_place_that_passes_the_gate_is_taken(monkeypatch, yard):
+    far = [3 * yard.object.diagonal, 0, 0]
+    found = chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.4, far))
+    assert found.registered and found.total == 0.8
+    # The margin is the lead over the next place where that is less than over other poses.
+    assert found.outcome.decision.margin == 0.5
+    found = chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.6, far))
+    assert found.outcome.decision.margin == pytest.approx(0.25)
+
+
+def test_an_object_that_fits_two_places_is_refused(monkeypatch, yard):
+    far = [3 * yard.object.diagonal, 0, 0]
+    for passes in (True, False):
+        found = chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.79, far, passes))
+        assert not found.registered and "another place is nearly as good, at (" in found.reason
+    # The same place twice, by the whole scene and by a part of it, is one.
+    near = [0.1 * yard.object.diagonal, 0, 0]
+    assert chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.79, near)).registered
+
+
+def test_an_object_that_fits_nowhere_may_not_be_there(monkeypatch, yard):
+    found = chosen(
+        monkeypatch,
+        yard,
+        tried(0.1, [0, 0, 0], False),
+        tried(0.3, [9, 0, 0], False, 0.12),
+        tried(0.2, [0, 9, 0], False),
+    )
+    assert not found.registered
+    assert found.reason.startswith("the best place shows 12% of the object, which may not be in this scene: its own")
+
+
+def test_a_scene_without_a_raised_part_has_no_place(yard):
+    rng = np.random.default_rng(0)
+    flat = np.c_[rng.uniform(0, 50, (20_000, 2)), rng.normal(0, 0.01, 20_000)]
+    scene = replace(yard.scene[np.arange(20_000)], points=flat)
+    assert likely_places(yard.object, scene, None, CropSettings(), 0) == []
