@@ -196,7 +196,7 @@ def find_in_scene(
     up_in_scene: Array | None = None,
     scales: ScaleRange | None = None,
     unit: str = "scene units",
-) -> tuple[Registration, Cloud, str]:
+) -> tuple[Registration, Cloud, int]:
     """Find where an object lies in a scene that may be thirty times as wide (method R16).
 
     It is registered in the whole scene, as if that showed little else, and in each of `likely_places`. The best has to
@@ -207,7 +207,7 @@ def find_in_scene(
         up_in_scene: unit vector (3,), opposite to gravity; None where it is not known.
 
     Returns:
-        The best registration, the part of the scene that it was found in, and what that is in words.
+        The best registration, the part of the scene that it was found in, and at how many places it was tried.
 
     Raises:
         StageError: as of `register_clouds`.
@@ -217,11 +217,9 @@ def find_in_scene(
         with contextlib.suppress(StageError):  # too few different points there
             tried.append((_registered(obj, scene[rows], settings, seed, ups, scales, unit), scene[rows]))
     found, part = max(tried, key=lambda one: (one[0].registered, one[0].total))
-    searched = f"the whole scene, {len(scene)} points"
     if len(tried) > 1:
-        searched += f", and {len(tried) - 1} places in it that look like the object"
         found = _unless_elsewhere(found, [other for other, _ in tried], obj, settings.fine)
-    return _compared(found, obj, part, settings, seed), part, searched
+    return _compared(found, obj, part, settings, seed), part, len(tried) - 1
 
 
 def _unless_elsewhere(

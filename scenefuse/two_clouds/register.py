@@ -118,10 +118,11 @@ def register(
     crs = las_crs(scene)
     unit = "scene units" if crs is None else unit_and_name(crs)[0]
     if known.fiducials is None and known.crop_box is None:
-        found, part, searched = find_in_scene(
+        found, part, places = find_in_scene(
             given.object, given.scene.part, settings, seed, ups=given.ups, up_in_scene=known.ups()[1], scales=scales,
             unit=unit,
         )  # fmt: skip
+        searched = f"{given.searched}, and {places} places in it that look like the object"
         given = replace(given, scene=replace(given.scene, part=part), searched=searched)
     else:
         found = register_clouds(given.object, given.scene.part, settings, seed, ups=given.ups, scales=scales, unit=unit)
