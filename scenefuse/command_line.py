@@ -117,6 +117,27 @@ def _configfiles() -> list[Path]:
     return found
 
 
+def _export() -> None:
+    """make what is handed over of finished objects: surfaces, drawings, tiles, cameras"""
+    parser = argparse.ArgumentParser(
+        prog="scenefuse export",
+        description="Make surfaces, drawings, tiles and cameras of finished objects; nothing before them runs again.",
+        epilog="All other options are Snakemake's.",
+    )
+    parser.add_argument("--what", nargs="+", choices=EXPORTS, default=list(EXPORTS), help="all of them if not given")
+    parser.add_argument("--object", nargs="+", dest="names", help="names; all finished objects if not given")
+    words, others = parser.parse_known_args(sys.argv[1:])
+    finished = sorted(path.parent.name for path in Path().glob("results/objects/*/fused.ply"))
+    missing = [name for name in words.names or () if name not in finished]
+    if missing or not finished:
+        which = f"object '{missing[0]}' has" if missing else "no object has"
+        sys.exit(f"error: {which} a results/objects/NAME/fused.ply here; run the workflow first (scenefuse run)")
+    rules, targets = zip(*(EXPORTS[what] for what in words.what))
+    wanted = {target.format(object=name) for target in targets for name in words.names or finished}
+    sys.argv = [sys.argv[0], *sorted(wanted), *others, "--allowed-rules", *sorted({*rules, "make_surface"})]
+    _run()
+
+
 def _run() -> None:
     """run the workflow in this folder, by Snakemake and with its options"""
     from scenefuse.complete import snakemake_command
@@ -150,11 +171,16 @@ def _complete() -> None:
     run(complete)
 
 
+# The rule of each thing that is handed over, and its target.
+EXPORTS = {
+    "surface": ("make_surface", "results/objects/{object}/surface.json"),
+}
 PARTS: dict[str, Callable[[], None]] = {
     "complete": _complete,
     "register": _register,
     "init": _init,
     "pick": _pick,
     "run": _run,
+    "export": _export,
     "nerf": _nerf,
 }

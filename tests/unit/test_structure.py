@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = ROOT / "scenefuse"
 # In the order in which data flow; each imports only itself and what stands before it.
 PACKAGES = ["core", "cloud", "photos", "marks", "geometry", "sfm", "georef", "mvs", "masks", "nerf", "crop"]
-PACKAGES += ["register", "fuse", "metrics", "report", "paper", "pick", "two_clouds"]
+PACKAGES += ["register", "fuse", "surface", "metrics", "report", "paper", "pick", "two_clouds"]
 MAY_IMPORT = {name: set(PACKAGES[: PACKAGES.index(name) + 1]) for name in PACKAGES}
 # The demo is outside the library: it writes captures and their truth, and no package imports it.
 MAY_IMPORT |= {"demo": {"core", "cloud", "photos", "metrics", "demo"}, "config": {*PACKAGES, "demo"}}

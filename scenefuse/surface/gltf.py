@@ -1,0 +1,166 @@
+"""GLB files: metres, right-handed, y up; each class of faces with its own feature id and material.
+
+Sources: glTF 2.0 (Khronos), EXT_mesh_features (Cesium), KHR_materials_unlit (photos hold their own light).
+"""
+
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from scenefuse.cloud.crs import LINEAR_UNITS
+from scenefuse.core.stage import atomic_file, read_json, value
+from scenefuse.core.transforms import Array
+from scenefuse.core.version import VERSION
+from scenefuse.photos.geodesy import length_unit
+from scenefuse.surface.mesh import FaceClass, Surface
+
+# (x, y, z) east, north, up to glTF's x east, y up, z south.
+Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+# What nobody measured is drawn in one colour (linear RGBA), which photos of objects hardly hold.
+BRIDGED_TINT = (0.6, 0.1, 0.5, 1.0)
+# glTF's codes of component types, and those of buffers.
+FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
+VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
+
+
+class _Buffer:
+    """The binary part of a GLB, and what its JSON says of it."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.length = 0
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def add(self, data: bytes, target: int | None = None) -> int:
+        """A view of some bytes, by its number."""
+        self.views.append({"buffer": 0, "byteOffset": self.length, "byteLength": len(data)})
+        if target:
+            self.views[-1]["target"] = target
+        padded = data + b"\0" * (-len(data) % 4)
+        self.parts.append(padded)
+        self.length += len(padded)
+        return len(self.views) - 1
+
+    def accessor(self, values: NDArray[Any], kind: str, component: int, **more: Any) -> int:
+        """An accessor of rows of values, by its number."""
+        target = INDEX_BUFFER if component == UNSIGNED_INT else VERTEX_BUFFER
+        view = self.add(np.ascontiguousarray(values).tobytes(), target)
+        entry = {"bufferView": view, "componentType": component, "count": len(values), "type": kind, **more}
+        self.accessors.append(entry)
+        return len(self.accessors) - 1
+
+
+def write_glb(
+    path: Path,
+    surface: Surface,
+    extras: dict[str, Any],
+    metres: float = 1.0,
+    uv: Array | None = None,
+    picture: NDArray[np.uint8] | None = None,
+) -> None:
+    """Write a surface, a primitive for each class of its faces; a file without meshes where it has no faces.
+
+    Args:
+        path: output.
+        surface: with z up.
+        extras: goes into `asset.extras`.
+        metres: per unit of the surface.
+        uv: (F, 3, 2) places of the faces' corners in the picture, from its upper left, 0..1; None for vertex colours.
+        picture: (H, W, 3) uint8, what photos show.
+    """
+    buffer, primitives = _Buffer(), list[dict[str, Any]]()
+    for kind in FaceClass:
+        chosen = surface.classes == kind
+        if chosen.any():
+            corners = uv[chosen] if uv is not None and kind != FaceClass.BRIDGED else None
+            primitives.append(_primitive(buffer, surface.part(chosen), kind, metres, corners))
+    unlit: dict[str, Any] = {"extensions": {"KHR_materials_unlit": {}}, "doubleSided": True}
+    colored: dict[str, Any] = {"name": "photos", "pbrMetallicRoughness": {"metallicFactor": 0.0}, **unlit}
+    tinted = {"name": "bridged", "pbrMetallicRoughness": {"baseColorFactor": BRIDGED_TINT}, **unlit}
+    content: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": f"scenefuse {VERSION}", "extras": extras},
+        "scene": 0,
+        "scenes": [{"nodes": [0]} if primitives else {}],
+    }
+    if primitives:
+        content |= {
+            "extensionsUsed": ["EXT_mesh_features", "KHR_materials_unlit"],
+            "nodes": [{"mesh": 0}],
+            "meshes": [{"primitives": primitives}],
+            "materials": [colored, tinted],
+        }
+        if picture is not None and uv is not None:
+            encoded = io.BytesIO()
+            Image.fromarray(picture).save(encoded, "JPEG", quality=90)
+            content["images"] = [{"bufferView": buffer.add(encoded.getvalue()), "mimeType": "image/jpeg"}]
+            content["textures"] = [{"source": 0}]
+            colored["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+        content |= {"bufferViews": buffer.views, "accessors": buffer.accessors}
+        content["buffers"] = [{"byteLength": buffer.length}]
+    text = json.dumps(content, allow_nan=False).encode()
+    chunks = [(b"JSON", text + b" " * (-len(text) % 4))]
+    chunks += [(b"BIN\0", b"".join(buffer.parts))] if primitives else []
+    body = b"".join(struct.pack("<I4s", len(data), name) + data for name, data in chunks)
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+
+
+def _primitive(buffer: _Buffer, part: Surface, kind: FaceClass, metres: float, uv: Array | None) -> dict[str, Any]:
+    """One class of faces; with `uv` (F, 3, 2), vertices that lie in several places of the picture are several."""
+    vertices, faces = part.vertices, part.faces
+    if uv is not None:
+        keys = np.column_stack([faces.ravel(), np.round(uv.reshape(-1, 2) * 2**20)]).astype(np.int64)
+        _, first, again = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        vertices, faces, places = vertices[faces.ravel()[first]], again.reshape(-1, 3), uv.reshape(-1, 2)[first]
+    assert vertices.normals is not None
+    positions = (metres * vertices.points @ Y_UP_FROM_Z_UP.T).astype(np.float32)
+    length = np.linalg.norm(vertices.normals, axis=1, keepdims=True)
+    normals = np.where(length > 0, vertices.normals / np.maximum(length, 1e-12), [0, 0, 1]) @ Y_UP_FROM_Z_UP.T
+    bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
+    attributes = {
+        "POSITION": buffer.accessor(positions, "VEC3", FLOAT, **bounds),
+        "NORMAL": buffer.accessor(normals.astype(np.float32), "VEC3", FLOAT),
+        "_FEATURE_ID_0": buffer.accessor(np.full(len(positions), kind, np.float32), "SCALAR", FLOAT),
+    }
+    if uv is not None:
+        attributes["TEXCOORD_0"] = buffer.accessor(places.astype(np.float32), "VEC2", FLOAT)
+    elif vertices.colors is not None and kind != FaceClass.BRIDGED:
+        linear = np.where(
+            vertices.colors <= 10, vertices.colors / 3294.6, ((vertices.colors / 255 + 0.055) / 1.055) ** 2.4
+        )
+        rgba = np.column_stack([np.rint(65535 * linear), np.full(len(linear), 65535)]).astype(np.uint16)
+        attributes["COLOR_0"] = buffer.accessor(rgba, "VEC4", UNSIGNED_SHORT, normalized=True)
+    return {
+        "attributes": attributes,
+        "indices": buffer.accessor(faces.astype(np.uint32).ravel(), "SCALAR", UNSIGNED_INT),
+        "material": int(kind == FaceClass.BRIDGED),
+        "extensions": {
+            "EXT_mesh_features": {"featureIds": [{"featureCount": len(FaceClass), "attribute": 0, "label": "class"}]}
+        },
+        "extras": {"class": kind.name.lower()},
+    }
+
+
+def metres_per_unit(georeference_json: Path | None) -> float:
+    """Metres in a unit of a scene; 1 where that is unknown."""
+    names = {name: metres for name, metres in LINEAR_UNITS.values()}
+    return names.get(length_unit(georeference_json), 1.0)
+
+
+def place_of_scene(georeference_json: Path | None) -> dict[str, Any]:
+    """What `asset.extras` says of the frame of a scene's surfaces and of its place in the world."""
+    known = {} if georeference_json is None else read_json(georeference_json)
+    content = {
+        "axes": "x east, y up, z south; before that, in the scene, x east, y north, z up",
+        "scene_unit": length_unit(georeference_json),
+        "classes": {kind.name.lower(): int(kind) for kind in FaceClass},
+    }
+    names = ("crs", "origin_in_crs", "crs_from_scene")
+    return content | {name: value(known, name) for name in names if name in known}

@@ -1,0 +1,128 @@
+"""The stage that makes the surface of one completed object."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from scenefuse.cloud.clouds import Cloud, read_cloud, records_of
+from scenefuse.cloud.readers.columns import COLOR, NORMAL, POSITION
+from scenefuse.core.machine import use_threads
+from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, threads, value, write_json
+from scenefuse.core.transforms import Sim3
+from scenefuse.geometry.photo_check import moved_view
+from scenefuse.photos.geodesy import length_unit
+from scenefuse.photos.workspace import View, read_views
+from scenefuse.surface.gltf import metres_per_unit, place_of_scene, write_glb
+from scenefuse.surface.mesh import FaceClass, Surface, make_mesh
+
+
+@dataclass(frozen=True)
+class SurfaceInputs:
+    """What the surface of one object is made of."""
+
+    fused: Path
+    """The object in its surroundings (PLY)."""
+    fusion_json: Path
+    """JSON of the fusion, for the object's place in the scene."""
+    object_workspace: Path | None = None
+    """The object's undistorted COLMAP workspace, where it has photos."""
+    scene_workspace: Path | None = None
+    """The scene's, in the frame of its cloud."""
+    georeference_json: Path | None = None
+    """JSON of the scene, for its unit and its place in the world."""
+
+
+def make_surface(*, inputs: SurfaceInputs, surface: Path, glb: Path, report: Path) -> None:
+    """Make the surface of an object in its surroundings, each face classed by what photos know of the place (F7).
+
+    Where the points have no surface, the files are empty and the report says why.
+
+    Args:
+        inputs: see SurfaceInputs.
+        surface: output PLY in the scene's frame; vertices have `evidence`, `deviation` and `class`, faces `class`.
+        glb: output GLB in metres, y up; the scene's place in the world is in `asset.extras`.
+        report: output JSON: areas and their shares.
+    """
+    start = time.perf_counter()
+    use_threads(threads())
+    try:
+        found, reason = make_mesh(read_cloud(inputs.fused), [view for _, view in placed_views(inputs)]), ""
+    except StageError as error:
+        print(f"no surface: {error}", flush=True)
+        found, reason = _nothing(), str(error)
+    write_surface(surface, found)
+    write_glb(glb, found, place_of_scene(inputs.georeference_json), metres_per_unit(inputs.georeference_json))
+    content = surface_report(found, length_unit(inputs.georeference_json))
+    content |= {"reason": quantity(reason, ""), "seconds": quantity(time.perf_counter() - start, "s")}
+    write_json(report, content)
+
+
+def placed_views(inputs: SurfaceInputs) -> list[tuple[Path, View]]:
+    """The cameras of both sides in the scene's frame, each with its workspace; an object without a place has none."""
+    found = []
+    matrix = value(read_json(inputs.fusion_json), "scene_from_object")
+    if inputs.object_workspace is not None and matrix is not None:
+        pose = Sim3.from_matrix(np.array(matrix))
+        own = read_views(inputs.object_workspace / "sparse")
+        found += [(inputs.object_workspace, moved_view(view, pose)) for view in own]
+    if inputs.scene_workspace is not None:
+        found += [(inputs.scene_workspace, view) for view in read_views(inputs.scene_workspace / "sparse")]
+    return found
+
+
+def _nothing() -> Surface:
+    """A surface without faces."""
+    fields = {"evidence": np.zeros(0, np.uint8), "deviation": np.zeros(0, np.float32), "class": np.zeros(0, np.uint8)}
+    vertices = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), None, fields)
+    return Surface(vertices, np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), 0.0)
+
+
+def surface_report(surface: Surface, unit: str) -> dict[str, Any]:
+    """Areas by class, and their shares of all that is closed or could be."""
+    areas = surface.areas()
+    by_class = {kind.name.lower(): float(areas[surface.classes == kind].sum()) for kind in FaceClass}
+    by_class["open"] = surface.open_area
+    total = sum(by_class.values())
+    return {
+        "status": quantity("made" if len(surface.faces) else "empty", ""),
+        "faces": quantity(len(surface.faces), "faces"),
+        **{f"{name}_area": quantity(area, f"{unit}2") for name, area in by_class.items()},
+        **{name: quantity(area / total if total else None, "of the area") for name, area in by_class.items()},
+        "notes": quantity(list(surface.notes), ""),
+    }
+
+
+def write_surface(path: Path, surface: Surface) -> None:
+    """Write a binary PLY mesh."""
+    vertices = PlyElement.describe(records_of(surface.vertices, path), "vertex")
+    faces = np.empty(len(surface.faces), [("vertex_indices", "i4", (3,)), ("class", "u1")])
+    faces["vertex_indices"], faces["class"] = surface.faces, surface.classes
+    with atomic_file(path) as temporary:
+        PlyData([vertices, PlyElement.describe(faces, "face")], byte_order="<").write(str(temporary))
+
+
+def read_surface(path: Path) -> Surface:
+    """Read what `write_surface` wrote; the area of open gaps is not in it.
+
+    Raises:
+        StageError: it is missing or cut short.
+    """
+    try:
+        content = PlyData.read(str(path))
+        table, faces = content["vertex"].data, content["face"].data
+        columns = {name: np.asarray(table[name]) for name in table.dtype.names}
+        indices = np.asarray(faces["vertex_indices"].tolist(), np.int64).reshape(-1, 3)
+    except Exception as error:
+        raise StageError(f"{path} is no surface ({error}); make it again with scenefuse export") from None
+    xyz, normals, rgb = ([columns.pop(name, None) for name in names] for names in (POSITION, NORMAL, COLOR))
+    vertices = Cloud(
+        np.stack(xyz, axis=1),
+        np.stack(normals, axis=1),
+        None if rgb[0] is None else np.stack(rgb, axis=1),
+        columns,
+    )
+    return Surface(vertices, indices, np.asarray(faces["class"]), 0.0)

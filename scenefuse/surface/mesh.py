@@ -1,0 +1,264 @@
+"""The surface of a completed cloud, each face classed by what photos know of the place (method F7).
+
+Screened Poisson (Kazhdan, Hoppe 2013) gives a closed candidate. What lies beside points stays; of the rest, narrow gaps
+are bridged where their rim is measured and no photo sees through them, and all else stays open.
+"""
+
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample
+from scenefuse.core.stage import StageError, threads
+from scenefuse.core.transforms import Array
+from scenefuse.fuse.compare import MARGIN, SAME_PLACE_SPACINGS, THROUGH_PHOTOS
+from scenefuse.fuse.measure import MIN_NEIGHBOURS, SUPPORT, Evidence, with_normals
+from scenefuse.photos.workspace import View
+
+Rows = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+# Points that a surface is made from at most: memory and time grow with them.
+MAX_POINTS = 1_000_000
+# Levels of the octree at most: finer than the surface of so many points.
+MAX_DEPTH = 11
+# Widest gap that is bridged, as a share of the diagonal: where a surface bends by a right angle in the middle of a gap,
+# it passes at half the width from what closes it, which is 1 % at most.
+MAX_GAP = 2 * MARGIN
+# The candidate reaches so far beyond the points' box, as a share of its longest side.
+BEYOND_BOX = 1.1
+
+
+class FaceClass(IntEnum):
+    """Values of `class` on faces and vertices."""
+
+    UNCONFIRMED = 0
+    """Beside points that no photo confirms, or that were not checked."""
+    MEASURED = 1
+    """Beside points that photos confirm."""
+    BRIDGED = 2
+    """Interpolated over a gap."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh in the scene's frame.
+
+    Attributes:
+        vertices: V of them, with outward normals, colours where the cloud has some, and the fields `evidence`,
+            `deviation` (NaN where unknown or interpolated) and `class`.
+        faces: (F, 3) rows of vertices, counter-clockwise from outside.
+        classes: (F,) uint8 values of `FaceClass`.
+        open_area: of the gaps that stay open, by the faces that would close them; those at the cloud's border, where
+            nothing says how far the surface goes on, are not counted.
+        notes: what a user should know.
+    """
+
+    vertices: Cloud
+    faces: Rows
+    classes: NDArray[np.uint8]
+    open_area: float
+    notes: tuple[str, ...] = ()
+
+    def areas(self) -> Array:
+        """(F,) of the faces."""
+        return _areas(self.vertices.points, self.faces)
+
+    def part(self, chosen: Mask) -> "Surface":
+        """Only the chosen faces (F,) and their vertices."""
+        used, faces = np.unique(self.faces[chosen], return_inverse=True)
+        return replace(
+            self, vertices=self.vertices[used], faces=faces.reshape(-1, 3), classes=self.classes[chosen], open_area=0.0
+        )
+
+
+def make_mesh(cloud: Cloud, views: list[View]) -> Surface:
+    """The surface of a completed cloud.
+
+    Args:
+        cloud: of an object and its surroundings; the field `evidence` says which points photos confirm.
+        views: the photos of both sides in its frame; without any, nothing shows that a gap is empty space.
+
+    Raises:
+        StageError: the points lie in a line or in one place, or are too few to have a surface.
+    """
+    notes = []
+    step, count = spacing(cloud.points), len(cloud)
+    if count <= MIN_NEIGHBOURS or step == 0 or np.linalg.matrix_rank(cloud.points - cloud.points.mean(0), step) < 2:
+        raise StageError(
+            f"{count} points have no surface; at least {MIN_NEIGHBOURS + 1} that lie in no line are needed"
+        )
+    while len(cloud) > MAX_POINTS:
+        step *= max(1.1, np.sqrt(len(cloud) / MAX_POINTS))
+        cloud = voxel_downsample(cloud, step)
+    if len(cloud) < count:
+        notes.append(f"{len(cloud):,} of {count:,} points were used, {step:.3g} apart")
+    cloud = oriented(cloud, views)
+    points, faces, normals = _poisson(cloud, step)
+    tree = cKDTree(cloud.points)
+    confirmed = cloud.fields.get("evidence", np.zeros(len(cloud))) == Evidence.MEASURED
+    middle = points[faces].mean(1)
+    distance, nearest = tree.query(middle, workers=threads())
+    near = distance <= _reach(cloud, tree)[nearest]
+    low, high, beyond = cloud.points.min(0), cloud.points.max(0), MAX_GAP / 2 * cloud.diagonal
+    inside = ((middle >= low - beyond) & (middle <= high + beyond)).all(1)
+    classes = np.where(near & confirmed[nearest], FaceClass.MEASURED, FaceClass.UNCONFIRMED)
+    gaps, is_open = _bridges(points, faces, distance, near, inside, classes, cloud, views)
+    classes[gaps] = FaceClass.BRIDGED
+    area = _areas(points, faces)
+    kept = near | gaps
+    _, own = tree.query(points, workers=threads())
+    vertices = Cloud(points, normals, None if cloud.colors is None else cloud.colors[own])
+    fields = cloud.fields
+    deviation = fields.get("deviation", np.full(len(cloud), np.nan, np.float32))[own]
+    vertices.fields["evidence"] = fields.get("evidence", np.zeros(len(cloud), np.uint8))[own]
+    of_vertex = np.full(len(points), FaceClass.BRIDGED, np.uint8)
+    # A vertex is measured if any of its faces is, else unconfirmed if any is.
+    for kind in (FaceClass.UNCONFIRMED, FaceClass.MEASURED):
+        of_vertex[faces[kept & (classes == kind)]] = kind
+    vertices.fields["deviation"] = np.where(of_vertex == FaceClass.BRIDGED, np.nan, deviation).astype(np.float32)
+    vertices.fields["class"] = of_vertex
+    whole = Surface(vertices, faces, classes.astype(np.uint8), 0.0, tuple(notes))
+    return replace(whole.part(kept), open_area=float(area[is_open].sum()))
+
+
+def oriented(cloud: Cloud, views: list[View]) -> Cloud:
+    """The cloud with normals that face outwards: its own; else those of local planes, towards the nearest camera, or
+    without cameras consistent with their neighbours."""
+    if cloud.normals is not None:
+        return cloud
+    cloud = with_normals(cloud)
+    assert cloud.normals is not None
+    if views:
+        centres = np.array([view.centre for view in views])
+        towards = centres[cKDTree(centres).query(cloud.points)[1]] - cloud.points
+        behind = (towards * cloud.normals).sum(1) < 0
+        return replace(cloud, normals=np.where(behind[:, None], -cloud.normals, cloud.normals))
+    points = _open3d_cloud(cloud, cloud.points.mean(0))
+    points.orient_normals_consistent_tangent_plane(MIN_NEIGHBOURS)
+    return replace(cloud, normals=np.asarray(points.normals).astype(np.float32))
+
+
+def _open3d_cloud(cloud: Cloud, middle: Array):  # type: ignore[no-untyped-def]
+    import open3d as o3d
+
+    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points - middle))
+    points.normals = o3d.utility.Vector3dVector(cloud.normals.astype(np.float64))
+    return points
+
+
+def _poisson(cloud: Cloud, step: float) -> tuple[Array, Rows, NDArray[np.float32]]:
+    """Vertices (V, 3), faces (F, 3) and normals (V, 3) of the closed candidate, in cells of the points' spacing."""
+    import open3d as o3d
+
+    middle = cloud.points.mean(0)
+    side = BEYOND_BOX * float(np.ptp(cloud.points, axis=0).max())
+    depth = int(np.clip(np.ceil(np.log2(side / step)), 1, MAX_DEPTH))
+    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+        _open3d_cloud(cloud, middle), depth=depth, scale=BEYOND_BOX, n_threads=threads()
+    )
+    mesh.remove_degenerate_triangles()
+    mesh.compute_vertex_normals()
+    normals = np.asarray(mesh.vertex_normals).astype(np.float32)
+    return np.asarray(mesh.vertices) + middle, np.asarray(mesh.triangles).astype(np.int64), normals
+
+
+def _reach(cloud: Cloud, tree: cKDTree) -> Array:
+    """(N,) how far from each point a face is still beside it: some of the local spacings, or a standard deviation."""
+    count = min(MIN_NEIGHBOURS + 1, len(cloud))
+    distance, near = tree.query(cloud.points, k=count, workers=threads())
+    local = np.median(distance[:, 1][near], axis=1)
+    deviation = cloud.fields.get("deviation", np.zeros(len(cloud)))
+    return np.asarray(np.maximum(SAME_PLACE_SPACINGS * local, np.nan_to_num(deviation)))
+
+
+def _bridges(
+    points: Array,
+    faces: Rows,
+    distance: Array,
+    near: Mask,
+    inside: Mask,
+    classes: Rows,
+    cloud: Cloud,
+    views: list[View],
+) -> tuple[Mask, Mask]:
+    """(F,) faces that bridge a gap, and those of gaps that stay open.
+
+    A gap is a piece of the candidate without points beside it, all of it in their box or half a gap's width beyond. It
+    is bridged where it is nowhere wider than MAX_GAP, most of its rim is measured, and photos do not see through it.
+    """
+    far = np.flatnonzero(~near)
+    pairs, alone = _neighbours(faces)
+    place = np.full(len(faces), -1)
+    place[far] = np.arange(len(far))
+    linked = pairs[(place[pairs] >= 0).all(1)]
+    graph = coo_matrix((np.ones(len(linked)), place[linked].T), shape=(len(far), len(far)))
+    count, gap = connected_components(graph, directed=False)
+    half_width, at_border = np.zeros(count), np.zeros(count, dtype=bool)
+    np.maximum.at(half_width, gap, distance[far])
+    at_border[gap[~inside[far] | alone[far]]] = True
+    rim = pairs[(place[pairs] >= 0).sum(1) == 1]
+    rim = np.where(place[rim[:, :1]] >= 0, rim, rim[:, ::-1])
+    of, measured = gap[place[rim[:, 0]]], classes[rim[:, 1]] == FaceClass.MEASURED
+    rim_length, confirmed = np.bincount(of, minlength=count), np.bincount(of, measured, count)
+    good = ~at_border & (2 * half_width <= MAX_GAP * cloud.diagonal) & (confirmed >= SUPPORT * rim_length)
+    tried = good[gap]
+    chosen = far[tried]
+    if views and len(chosen):
+        kept = caster(points, faces[classes == FaceClass.MEASURED])
+        seen = _seen_through(points[faces[chosen]].mean(1), kept, views, MARGIN * cloud.diagonal)
+        through = np.bincount(gap[tried], seen, count)
+        good &= through < SUPPORT * np.bincount(gap, minlength=count)
+    bridged, is_open = np.zeros(len(faces), dtype=bool), np.zeros(len(faces), dtype=bool)
+    bridged[far], is_open[far] = good[gap], ~good[gap] & ~at_border[gap]
+    return bridged, is_open
+
+
+def caster(points: Array, faces: Rows):  # type: ignore[no-untyped-def]
+    """Open3D's ray caster with a mesh."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene(threads())
+    scene.add_triangles(points.astype(np.float32), faces.astype(np.uint32))
+    return scene
+
+
+def cast(scene, origins: Array, directions: Array) -> dict[str, NDArray[np.floating]]:  # type: ignore[no-untyped-def]
+    """What rays (N, 3) hit: `t_hit` in lengths of their directions, `primitive_ids`, `primitive_normals`, ..."""
+    rays = np.concatenate([np.broadcast_to(origins, directions.shape), directions], axis=1).astype(np.float32)
+    return {name: values.numpy() for name, values in scene.cast_rays(rays, nthreads=threads()).items()}
+
+
+def _seen_through(places: Array, scene, views: list[View], margin: float) -> Mask:  # type: ignore[no-untyped-def]
+    """(N,) places behind which enough photos see the front of a measured face, farther off than a margin."""
+    count = np.zeros(len(places), np.int64)
+    for view in views:
+        rows = view.visible(places)[0]
+        rays = places[rows] - view.centre
+        hit = cast(scene, view.centre, rays)
+        length = np.linalg.norm(rays, axis=1)
+        front = (hit["primitive_normals"] * rays).sum(1) < 0
+        count[rows] += front & np.isfinite(hit["t_hit"]) & ((hit["t_hit"] - 1) * length > margin)
+    return count >= THROUGH_PHOTOS
+
+
+def _neighbours(faces: Rows) -> tuple[Rows, Mask]:
+    """(E, 2) faces that share an edge, and (F,) those with an edge that no other has."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    key = edges[:, 0] * (int(faces.max(initial=0)) + 1) + edges[:, 1]
+    order = np.argsort(key, kind="stable")
+    same = key[order][1:] == key[order][:-1]
+    pairs = np.stack([order[:-1][same], order[1:][same]], axis=1) // 3
+    shared = np.zeros(len(key), dtype=bool)
+    shared[order[1:][same]] = shared[order[:-1][same]] = True
+    return pairs, ~shared.reshape(-1, 3).all(1)
+
+
+def _areas(points: Array, faces: Rows) -> Array:
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)

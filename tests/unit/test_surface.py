@@ -1,0 +1,170 @@
+"""Surfaces of completed clouds: classes of faces, gaps, and the files that hold them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from scenefuse.cloud.clouds import Cloud, write_cloud
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import look_at
+from scenefuse.fuse.measure import Evidence
+from scenefuse.photos.workspace import View
+from scenefuse.surface.gltf import write_glb
+from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
+from scenefuse.surface.mesh import FaceClass, make_mesh
+
+# Spacing of points on a sphere, and the radius of a gap in it that is narrow beside its diagonal.
+STEP, NARROW = 0.012, 0.032
+TOP, ASIDE = np.array([0.0, 0, 1]), np.full(3, 3**-0.5)
+
+
+def with_evidence(points: np.ndarray, normals: np.ndarray, colors: np.ndarray | None = None) -> Cloud:
+    fields = {
+        "evidence": np.full(len(points), Evidence.MEASURED, np.uint8),
+        "deviation": np.full(len(points), 0.001, np.float32),
+    }
+    return Cloud(points, normals.astype(np.float32), colors, fields)
+
+
+def sphere(step: float) -> Cloud:
+    """A unit sphere, points about a step apart, colours by height."""
+    count = int(4 * np.pi / step**2)
+    height = 1 - 2 * (np.arange(count) + 0.5) / count
+    angle = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    ring = np.sqrt(1 - height**2)
+    points = np.column_stack([ring * np.cos(angle), ring * np.sin(angle), height])
+    colors = np.column_stack([np.full(count, 200), 128 + 100 * height, np.full(count, 40)]).astype(np.uint8)
+    return with_evidence(points, points, colors)
+
+
+def with_hole(cloud: Cloud, radius: float, place: np.ndarray = TOP) -> Cloud:
+    """Without the points around a place."""
+    return cloud[np.linalg.norm(cloud.points - place, axis=1) > radius]
+
+
+def away(surface, place: np.ndarray = TOP) -> np.ndarray:
+    """Distances of faces from a place."""
+    return np.linalg.norm(surface.vertices.points[surface.faces].mean(1) - place, axis=1)
+
+
+@pytest.fixture(scope="module")
+def closed():
+    """The surface of a sphere with a narrow gap at its top, whose lower half photos do not confirm."""
+    cloud = with_hole(sphere(STEP), NARROW)
+    cloud.fields["evidence"][cloud.points[:, 2] < 0] = Evidence.NERF_ONLY
+    return make_mesh(cloud, [])
+
+
+def test_a_narrow_gap_is_bridged_on_the_surface_that_its_rim_goes_on_as(closed):
+    bridged = closed.part(closed.classes == FaceClass.BRIDGED)
+    assert away(bridged).max() < NARROW and 0.1 < bridged.areas().sum() / (np.pi * NARROW**2) < 1
+    assert np.abs(np.linalg.norm(bridged.vertices.points, axis=1) - 1).max() < 0.01
+    inner = bridged.vertices.fields["class"] == FaceClass.BRIDGED
+    assert np.isnan(bridged.vertices.fields["deviation"][inner]).all()
+
+
+def test_a_wide_gap_stays_open_and_its_area_is_said():
+    surface = make_mesh(with_hole(sphere(0.03), 0.4, ASIDE), [])
+    assert away(surface, ASIDE).min() > 0.3
+    assert 0.5 < surface.open_area / (np.pi * 0.4**2) < 1.2
+
+
+def test_what_no_photo_confirms_is_told_apart(closed):
+    height = closed.vertices.points[closed.faces].mean(1)[:, 2]
+    assert (closed.classes[height < -2 * STEP] == FaceClass.UNCONFIRMED).all()
+    assert (closed.classes[(height > 2 * STEP) & (away(closed) > 0.1)] == FaceClass.MEASURED).all()
+
+
+def test_shares_of_the_classes_sum_to_the_whole_area(closed):
+    report = surface_report(closed, "m")
+    shares = [value(report, name) for name in ("measured", "unconfirmed", "bridged", "open")]
+    assert sum(shares) == pytest.approx(1)
+    assert sum(value(report, f"{n}_area") for n in ("measured", "unconfirmed", "bridged")) == pytest.approx(
+        4 * np.pi, rel=0.02
+    )
+
+
+def plate_over_ground() -> Cloud:
+    """A box over the ground with a narrow gap in its top and a wide one below that."""
+    rng = np.arange(-0.6, 0.6, 0.0125)
+    x, y = (a.ravel() for a in np.meshgrid(rng, rng))
+    narrow, wide = np.maximum(abs(x), abs(y)) > 0.03, np.maximum(abs(x), abs(y)) > 0.2
+    up, down = np.tile([0.0, 0, 1], (len(x), 1)), np.tile([0.0, 0, -1], (len(x), 1))
+    top, bottom = np.column_stack([x, y, 0 * x + 1]), np.column_stack([x, y, 0 * x + 0.6])
+    far = np.arange(-1.5, 1.5, 0.03)
+    ground = np.column_stack([*(a.ravel() for a in np.meshgrid(far, far)), np.zeros(len(far) ** 2)])
+    sides = []
+    for turn in range(4):
+        side = np.column_stack([0 * x + 0.6, x, 0.8 + y / 3])
+        sides.append(side @ Rotation.from_euler("z", 90 * turn, degrees=True).as_matrix().T)
+    points = np.concatenate([top[narrow], bottom[wide], ground, *sides])
+    outwards = [s * [1, 1, 0] / np.abs(s[:, :2]).max(1, keepdims=True) for s in sides]
+    outwards = [np.where(abs(abs(o) - 1) < 1e-6, np.sign(o), 0) * [1, 1, 0] for o in outwards]
+    normals = np.concatenate([up[narrow], down[wide], np.tile([0.0, 0, 1], (len(ground), 1)), *outwards])
+    return with_evidence(points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9))
+
+
+def from_above(count: int = 4) -> list[View]:
+    views = []
+    for k in range(count):
+        centre = np.array([0.1 * np.cos(k), 0.1 * np.sin(k), 5.0])
+        pose = np.eye(4)
+        pose[:3, :3] = look_at(centre, np.zeros(3), np.array([0, 1.0, 0]))
+        pose[:3, 3] = -pose[:3, :3] @ centre
+        views.append(View(str(k), np.array([[900.0, 0, 400], [0, 900, 400], [0, 0, 1]]), pose, 800, 800))
+    return views
+
+
+def test_a_gap_that_photos_see_through_stays_open():
+    cloud = plate_over_ground()
+    bridges = []
+    for views in ([], from_above()):
+        surface = make_mesh(cloud, views)
+        middle = surface.vertices.points[surface.faces[surface.classes == FaceClass.BRIDGED]].mean(1)
+        bridges.append(int(((np.abs(middle[:, :2]).max(1) < 0.03) & (np.abs(middle[:, 2] - 1) < 0.03)).sum()))
+    assert bridges[0] > 5 and bridges[1] == 0
+
+
+def test_points_in_a_line_have_no_surface_and_the_stage_says_so(tmp_path: Path):
+    line = np.column_stack([np.linspace(0, 1, 50), np.zeros((50, 2))])
+    cloud = with_evidence(line, np.tile([0.0, 0, 1], (50, 1)))
+    with pytest.raises(StageError, match="50 points have no surface"):
+        make_mesh(cloud, [])
+    write_cloud(tmp_path / "fused.ply", cloud)
+    write_json(tmp_path / "fusion.json", {"scene_from_object": quantity(None, "m")})
+    inputs = SurfaceInputs(tmp_path / "fused.ply", tmp_path / "fusion.json")
+    make_surface(inputs=inputs, surface=tmp_path / "s.ply", glb=tmp_path / "s.glb", report=tmp_path / "s.json")
+    assert "no surface" in value(read_json(tmp_path / "s.json"), "reason")
+    assert len(read_surface(tmp_path / "s.ply").faces) == 0
+    assert (tmp_path / "s.glb").read_bytes()[:4] == b"glTF"
+
+
+def test_a_written_surface_is_read_as_it_was(closed, tmp_path: Path):
+    write_surface(tmp_path / "surface.ply", closed)
+    again = read_surface(tmp_path / "surface.ply")
+    assert np.array_equal(again.faces, closed.faces) and np.array_equal(again.classes, closed.classes)
+    assert np.array_equal(again.vertices.points, closed.vertices.points)
+    assert set(again.vertices.fields) == {"evidence", "deviation", "class"}
+
+
+def test_another_reader_finds_metres_with_y_up_and_the_classes_in_the_glb(closed, tmp_path: Path):
+    path = tmp_path / "surface.glb"
+    write_glb(path, closed, {"crs": "EPSG:32632"}, metres=0.3048)
+    content = path.read_bytes()
+    header = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    assert header["asset"]["extras"]["crs"] == "EPSG:32632"
+    scene = trimesh.load_scene(path)
+    assert sum(len(mesh.faces) for mesh in scene.geometry.values()) == len(closed.faces)
+    low, high = scene.bounds
+    assert np.allclose([low, high], [[-0.3048] * 3, [0.3048] * 3], atol=0.01)
+    ids = {int(mesh.vertex_attributes["_FEATURE_ID_0"].ravel()[0]): mesh for mesh in scene.geometry.values()}
+    assert set(ids) == {int(kind) for kind in FaceClass}
+    assert ids[FaceClass.UNCONFIRMED].vertices[:, 1].max() < 0.05 < ids[FaceClass.BRIDGED].vertices[:, 1].min()
+    assert sum(mesh.area for mesh in ids.values()) == pytest.approx(0.3048**2 * closed.areas().sum(), rel=1e-4)
+    normals = ids[FaceClass.MEASURED].face_normals
+    middle = ids[FaceClass.MEASURED].triangles_center
+    assert ((normals * middle).sum(1) > 0).mean() > 0.999

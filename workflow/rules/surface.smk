@@ -1,0 +1,37 @@
+# What is handed over of the completed objects. `scenefuse export` asks for it; `all` does not.
+#
+# INPUTS    results/objects/{object}/fused.ply, fusion.json, undistorted/; results/scenes/{scene}/undistorted/, georeference.json
+# OUTPUTS   results/objects/{object}/surface.ply, surface.glb, surface.json
+
+
+rule make_surface:
+    """The surface of a completed object: measured, bridged and open parts told apart (F7)."""
+    input:
+        fused="results/objects/{object}/fused.ply",
+        fusion="results/objects/{object}/fusion.json",
+        object_workspace=judging_photos,
+        scene_workspace=in_photographed_scene("undistorted"),
+        georeference=in_scene("georeference.json"),
+    output:
+        surface="results/objects/{object}/surface.ply",
+        glb="results/objects/{object}/surface.glb",
+        report="results/objects/{object}/surface.json",
+    log:
+        "results/logs/make_surface/{object}.log",
+    benchmark:
+        "results/benchmarks/make_surface/{object}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    threads: OBJECT_THREADS
+    resources:
+        mem_mb=by_size(3000, fused=50),
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        photos=options_of("object_workspace", "scene_workspace"),
+        script=script("surface/make_surface.py"),
+        code=code("surface/make_surface.py"),
+    message:
+        "{wildcards.object}: surface"
+    shell:
+        "exec python {params.script} --fused {input.fused} --fusion-json {input.fusion} {params.photos}"
+        " --georeference-json {input.georeference} --surface {output.surface} --glb {output.glb} --report {output.report} &> {log}"
