@@ -6,18 +6,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, records_of
+from scenefuse.cloud.clouds import Cloud, read_cloud, records_of, sampled
 from scenefuse.cloud.readers.columns import COLOR, NORMAL, POSITION
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Sim3
-from scenefuse.geometry.photo_check import moved_view
+from scenefuse.geometry.photo_check import MAX_PHOTOS, covering, moved_view
 from scenefuse.photos.geodesy import length_unit
-from scenefuse.photos.workspace import View, read_views
+from scenefuse.photos.workspace import View, Workspace, read_views
 from scenefuse.surface.gltf import metres_per_unit, place_of_scene, write_glb
 from scenefuse.surface.mesh import FaceClass, Surface, make_mesh
+from scenefuse.surface.texture import Textured, textured
+
+# Places of a surface at which it is counted which photos show it.
+PHOTO_SAMPLE = 2000
 
 
 @dataclass(frozen=True)
@@ -49,16 +54,55 @@ def make_surface(*, inputs: SurfaceInputs, surface: Path, glb: Path, report: Pat
     """
     start = time.perf_counter()
     use_threads(threads())
+    views = placed_views(inputs)
     try:
-        found, reason = make_mesh(read_cloud(inputs.fused), [view for _, view in placed_views(inputs)]), ""
+        found, reason = make_mesh(read_cloud(inputs.fused), [view for _, view in views]), ""
     except StageError as error:
         print(f"no surface: {error}", flush=True)
         found, reason = _nothing(), str(error)
     write_surface(surface, found)
-    write_glb(glb, found, place_of_scene(inputs.georeference_json), metres_per_unit(inputs.georeference_json))
-    content = surface_report(found, length_unit(inputs.georeference_json))
-    content |= {"reason": quantity(reason, ""), "seconds": quantity(time.perf_counter() - start, "s")}
+    painted, why = paint(found, views)
+    place, metres = place_of_scene(inputs.georeference_json), metres_per_unit(inputs.georeference_json)
+    if painted is None:
+        write_glb(glb, found, place, metres)
+    else:
+        write_glb(glb, painted.surface, place, metres, painted.uv, painted.picture)
+    content = surface_report(found, length_unit(inputs.georeference_json)) | {
+        "reason": quantity(reason, ""),
+        "texture": quantity(why, ""),
+        "textured": quantity(0.0 if painted is None else painted.shown_share, "of the area that is not bridged"),
+        "seconds": quantity(time.perf_counter() - start, "s"),
+    }
     write_json(report, content)
+
+
+def paint(surface: Surface, views: list[tuple[Path, View]]) -> tuple[Textured | None, str]:
+    """The surface with a picture from photos, and where that is from; None where there are none.
+
+    Args:
+        surface: in the scene's frame.
+        views: cameras there, each with its workspace.
+    """
+    sample = sampled(surface.vertices.points, PHOTO_SAMPLE, seed=0)
+    shown = np.zeros((len(views), len(sample)), dtype=bool)
+    for row, (_, view) in zip(shown, views):
+        row[view.visible(sample)[0]] = True
+    rows = np.flatnonzero(shown.any(1))
+    if not len(rows):
+        return None, "the colours of the points: no photo shows the surface"
+    centres = np.array([views[k][1].centre for k in rows])
+    chosen = [views[k] for k in rows[covering(shown[rows], centres, sample, 2 * MAX_PHOTOS)]]
+
+    def read(number: int) -> NDArray[np.uint8]:
+        folder, view = chosen[number]
+        return np.asarray(Workspace(folder, [], sample, [], []).rgb(view).pixels)
+
+    try:
+        painted = textured(surface, [view for _, view in chosen], read)
+    except StageError as error:
+        print(f"no texture: {error}", flush=True)
+        return None, f"the colours of the points: {error}"
+    return painted, f"{len(chosen)} photos" if painted else "the colours of the points: no photo shows the surface"
 
 
 def placed_views(inputs: SurfaceInputs) -> list[tuple[Path, View]]:

@@ -1,6 +1,7 @@
 """Surfaces of completed clouds: classes of faces, gaps, and the files that hold them."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from scenefuse.photos.workspace import View
 from scenefuse.surface.gltf import write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
 from scenefuse.surface.mesh import FaceClass, make_mesh
+from scenefuse.surface.texture import textured
 
 # Spacing of points on a sphere, and the radius of a gap in it that is narrow beside its diagonal.
 STEP, NARROW = 0.012, 0.032
@@ -168,3 +170,25 @@ def test_another_reader_finds_metres_with_y_up_and_the_classes_in_the_glb(closed
     normals = ids[FaceClass.MEASURED].face_normals
     middle = ids[FaceClass.MEASURED].triangles_center
     assert ((normals * middle).sum(1) > 0).mean() > 0.999
+
+
+def test_a_planted_picture_lands_on_the_faces_that_a_photo_shows_it_on(closed):
+    """Photos from two sides, in one of which the sphere is red on the left and blue on the right, another exposure."""
+    views, pixels = from_above(3), []
+    for k, _ in enumerate(views):
+        picture = np.zeros((800, 800, 3), np.uint8)
+        picture[:, :400], picture[:, 400:] = (200, 40, 40), (40, 40, 200)
+        pixels.append((picture * (1 - 0.2 * k)).astype(np.uint8))
+    grey = replace(closed.vertices, colors=np.full((len(closed.vertices), 3), 100, np.uint8))
+    painted = textured(replace(closed, vertices=grey), views, lambda k: pixels[k])
+    side, faces = len(painted.picture), painted.surface.faces
+    middle = painted.surface.vertices.points[faces].mean(1)
+    at = np.floor(painted.uv.mean(1) * side).astype(int)
+    color = painted.picture[at[:, 1], at[:, 0]].astype(float)
+    top = (middle[:, 2] > 0.5) & (painted.surface.classes == FaceClass.MEASURED)
+    right = views[0].project(middle)[0][:, 0] > 400
+    assert (color[top & (middle[:, 0] < -0.1), 0] > color[top & (middle[:, 0] < -0.1), 2]).mean() > 0.98
+    assert (color[top & (middle[:, 0] > 0.1), 2] > color[top & (middle[:, 0] > 0.1), 0]).mean() > 0.98
+    assert right[top & (middle[:, 0] > 0.1)].all()
+    # No photo shows the lower half: the colour of the points.
+    assert np.allclose(color[middle[:, 2] < -0.5], 100, atol=2)
