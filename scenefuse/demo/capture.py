@@ -18,9 +18,6 @@ from scenefuse.demo.bodies import Body, Exposure, draw_exposure, expose
 from scenefuse.demo.world import MAPPED, ORIGIN, SUN, World, build_world, openness
 from scenefuse.metrics.true_cameras import Cameras, cameras_json, pinhole
 
-# Focal length of a photo in its widths.
-FOCAL_WIDTHS = 0.875
-
 
 @dataclass(frozen=True)
 class FlightSettings:
@@ -67,7 +64,7 @@ def height_px(width_px: int) -> int:
 
 def focal_px(width_px: int) -> float:
     """Focal length of a photo."""
-    return FOCAL_WIDTHS * width_px
+    return 0.875 * width_px
 
 
 def render_scene(*, photos: Path, truth: Path, settings: FlightSettings, camera: bodies.Kind, seed: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,8 +34,8 @@ class PhotoClicks:
         original: (N, 2) the same pixels in the original photo, as a person knows them; None where it is the same photo.
     """
 
-    pixels: Array
-    inside: NDArray[np.bool_]
+    pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    inside: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     box: Array | None = None
     original: Array | None = None
 

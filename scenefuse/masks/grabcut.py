@@ -14,7 +14,14 @@ from scipy.sparse.csgraph import dijkstra
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Hull, Mask, silhouette
 from scenefuse.marks.photo_clicks import PhotoClicks
-from scenefuse.masks.prompts import POINT_RADIUS_SHARE, Prompts, distance_to, prompted_parts
+from scenefuse.masks.prompts import (
+    BOX_GROWTH_SHARE,
+    OUTLINE_BAND_SHARE,
+    POINT_RADIUS_SHARE,
+    Prompts,
+    distance_to,
+    prompted_parts,
+)
 from scenefuse.masks.target import Target
 from scenefuse.photos.workspace import Rows, View, Workspace
 
@@ -27,13 +34,6 @@ COLOUR_BINS = 32
 SPECK_SHARE, PINHOLE_SHARE = 0.02, 0.0005
 # A hole is one if its colours are twice as frequent around the mask as on it: log 2, in nats.
 GAP_EVIDENCE_NATS = 0.7
-# How far around a mask colours are compared with its own, as a share of its longer side.
-SURROUNDINGS_SHARE = 0.1
-# Half width from which the middle of a part differs from its rim; how far a thin part reaches, in bands, beyond what
-# is certain.
-MIN_THIN_HALF_PX, MIN_THIN_BANDS = 1.5, 2.0
-# Coarse masks are cut along edges in photos at most this wide; wider ones would take seconds each.
-EDGE_WIDTH_PX = 1024
 # Paths between pixels: the picture is smoothed by this, and a step costs as much as this change of Lab.
 PATH_BLUR_PX, STEP_COST = 0.7, 0.15
 # What is this much nearer to the certain object than to certain background, as a share of both paths, is certain too:
@@ -43,10 +43,6 @@ MIN_GROWN_SHARE = 0.7
 FIRST_ROUNDS = 4
 # Seeds grow, and the colours of a mask are learnt, in photos at most this wide.
 COARSE_WIDTH_PX = 320
-# Half width of the band along the hull's outline where a photo's own evidence decides, as a share of its width.
-HULL_BAND_SHARE = 5 / 640
-# Outside a clicked box nothing is object from this share of its longer side on: a person's corners miss.
-MAX_BOX_MISS_SHARE = 0.04
 
 
 def first_trimap(size: tuple[int, int], outline_px: NDArray[np.float64], spanning_px: NDArray[np.float64]) -> Trimap:
@@ -206,21 +202,13 @@ def grabcut(image: NDArray[np.uint8], trimap: Trimap, width_px: int, iterations:
     return mask
 
 
-def along_edges(image: NDArray[np.uint8], mask: Mask, band_px: float) -> Mask:
-    """A coarse mask (H, W) moved to the edges of its photo (H, W, 3): cut again, but only this near its outline.
-
-    Of parts that are thinner than the band, and reach beyond it, the middle stays: nothing else of them is certain.
-    """
+def along_edges(image: NDArray[np.uint8], mask: Mask, band_px: float, width_px: int) -> Mask:
+    """A coarse mask (H, W) moved to the edges of its photo (H, W, 3): cut again in a photo at most this wide, but only
+    this near its outline."""
     inner, outer = distance_to(~mask), distance_to(mask)
     trimap = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[inner > band_px], trimap[outer > band_px] = cv2.GC_FGD, cv2.GC_BGD
-    certain = inner > band_px
-    middle = (inner >= MIN_THIN_HALF_PX) & (inner >= cv2.dilate(inner, np.ones((3, 3), np.uint8))) & ~certain
-    count, labels = cv2.connectedComponents(middle.astype(np.uint8))
-    thin = np.zeros(count, dtype=bool)
-    thin[labels[middle & (distance_to(certain) > MIN_THIN_BANDS * band_px)]] = True
-    trimap[middle & thin[labels]] = cv2.GC_FGD
-    return grabcut(image, trimap, EDGE_WIDTH_PX, 1) if mask.any() else mask
+    return grabcut(image, trimap, width_px, 1) if mask.any() else mask
 
 
 def cleaned(mask: Mask, image: NDArray[np.uint8] | None = None) -> Mask:
@@ -250,7 +238,7 @@ def _colours_of(image: NDArray[np.uint8], mask: Mask, unsure: Mask) -> Colours:
     """The colours of a mask (H, W), beside those around it; some thousands of pixels of each are enough."""
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     longest = max(width, height)
-    grow, step = int(SURROUNDINGS_SHARE * longest), max(1, longest // COARSE_WIDTH_PX)
+    grow, step = int(BOX_GROWTH_SHARE * longest), max(1, longest // COARSE_WIDTH_PX)
     near = np.s_[max(0, y - grow) : y + height + grow : step, max(0, x - grow) : x + width + grow : step]
     return learn_colours([image[near]], [mask[near]], [~mask[near] & ~unsure[near]])
 
@@ -294,7 +282,7 @@ def query_grabcut(width_px: int, view: View, prompts: Prompts, box: Array | None
     on, off = prompts.inside, prompts.outside
     trimap = np.full((view.height, view.width), cv2.GC_PR_BGD, dtype=np.uint8)
     if box is not None:
-        trimap[_off_box(trimap, box, MAX_BOX_MISS_SHARE)] = cv2.GC_BGD
+        trimap[_off_box(trimap, box, BOX_GROWTH_SHARE)] = cv2.GC_BGD
         trimap[~_off_box(trimap, box, 0)] = cv2.GC_PR_FGD
     elif len(on) >= 3:
         fill_hull(trimap, on, cv2.GC_PR_FGD)
@@ -341,7 +329,8 @@ def second_cuts(
     colours = learn_colours([view.pixels for view in photos.views], own, others)
     cut = []
     for k, (view, mask, outline) in enumerate(zip(photos.views, masks, outlines)):
-        trimap = second_trimap(outline, mask, colours.evidence(view.pixels), HULL_BAND_SHARE * view.width)
+        band_px = OUTLINE_BAND_SHARE * max(view.width, view.height)
+        trimap = second_trimap(outline, mask, colours.evidence(view.pixels), band_px)
         stamp(trimap, target, view, photos.seen[k], photos.seen_at[k], clicked.get(k))
         if not outline.any():
             cut.append(outline)
@@ -379,5 +368,5 @@ def stamp(
     if clicks is None:
         return
     if clicks.box is not None:
-        trimap[_off_box(trimap, clicks.box, MAX_BOX_MISS_SHARE)] = cv2.GC_BGD
+        trimap[_off_box(trimap, clicks.box, BOX_GROWTH_SHARE)] = cv2.GC_BGD
     _discs(trimap, clicks.off, clicks.on, radius)

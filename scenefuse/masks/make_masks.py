@@ -86,6 +86,7 @@ def make_masks(
     workspace = read_workspace(inputs.workspace)
     photos = replace(workspace, views=[workspace.rgb(view) for view in workspace.views])
     made, found, by = _make(inputs, photos, settings, seed)
+    made, found = _with_disputed(made, found, settings.min_photos)
     for sentence in found.left_out:
         print(f"left out of {inputs.prompts}: {sentence}", flush=True)
     for note in found.notes:
@@ -142,6 +143,19 @@ def _make(
         found = replace(found, notes=(*found.notes, note))
     made = _kept(scored, settings.keep, inputs.sparse, photos.views)
     return replace(made, dropped=unusable | made.dropped), found, by
+
+
+def _with_disputed(made: ScoredMasks, found: Prompted, min_photos: int) -> tuple[ScoredMasks, Prompted]:
+    """Where fewer masks agree than are needed, the others too: low certainty is said and shown, and ends nothing."""
+    disputed = {name for name in made.dropped if name in made.masks and made.masks[name].any()}
+    if len(made.masks) - len(set(made.dropped) & set(made.masks)) >= min_photos or not disputed:
+        return made, found
+    note = (
+        f"fewer than {min_photos} masks agree with each other: those of {', '.join(sorted(disputed))} are used although"
+        " they do not; look at them, and click in a photo whose mask is wrong"
+    )
+    dropped = {name: why for name, why in made.dropped.items() if name not in disputed}
+    return replace(made, dropped=dropped), replace(found, notes=(*found.notes, note))
 
 
 def _network(settings: MaskSettings) -> tuple[Sam2 | None, dict[str, Any]]:

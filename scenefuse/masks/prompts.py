@@ -15,6 +15,11 @@ NO_PIXELS: Array = np.zeros((0, 2))
 # How far a point's pixel may be off, as a share of the photo's longer side, about two pixels at 640: a disc of this
 # radius is certain, and points this near an outline do not vote.
 POINT_RADIUS_SHARE = 0.003
+# How far from an outline a pixel may lie and say nothing against it, as a share of the photo's longer side.
+OUTLINE_BAND_SHARE = 0.015
+# Growth of a box around an object, as a share of its longer side: points seldom mark its ends, and a person's corners
+# miss them.
+BOX_GROWTH_SHARE = 0.05
 
 
 class Prompts(NamedTuple):

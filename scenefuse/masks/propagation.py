@@ -1,8 +1,10 @@
 """Masks of all photos from a few clicks in one: the sparse points inside and outside its mask prompt the next photo."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +14,7 @@ from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks
 from scenefuse.masks.grabcut import cleaned
 from scenefuse.masks.prompts import (
-    NO_PIXELS,
+    OUTLINE_BAND_SHARE,
     Prompts,
     Segmenter,
     agreement,
@@ -31,6 +33,7 @@ from scenefuse.masks.votes import (
     vote_shares,
     voter_of,
 )
+from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.photos.workspace import View, Workspace
 
 # Weight of a mask's quality beside its agreement, when one of several is chosen.
@@ -38,12 +41,8 @@ QUALITY_WEIGHT = 0.3
 # For several clicks alone, where no mask has this quality, the largest is taken of those that score less by no more
 # than this: who clicks on several parts means the whole.
 CERTAIN_QUALITY, SCORE_MARGIN = 0.9, 0.06
-# Times that a photo is prompted again, with a known point on which its mask is wrong.
-CORRECTIONS = 3
-# A pixel off a mask by less than this share of the photo's longer side missed its outline; others are on a part.
-NEAR_MISS_SHARE = 0.015
 
-NO_CLICKS = PhotoClicks(np.zeros((0, 2)), np.zeros(0, dtype=bool))
+NO_CLICKS = PhotoClicks()
 
 
 @dataclass(frozen=True)
@@ -57,6 +56,7 @@ class Propagated:
         left_out: the clicks that contradict their mask, a sentence each.
         clicked: the others, by row of the photo.
         quality: of each photo's mask by the segmenter's own estimate, by the photo's name.
+        notes: what a person should know of the clicks, a sentence each.
     """
 
     masks: list[Mask]
@@ -65,6 +65,7 @@ class Propagated:
     left_out: list[str]
     clicked: dict[int, PhotoClicks]
     quality: dict[str, float]
+    notes: list[str]
 
 
 def propagate(
@@ -84,10 +85,11 @@ def propagate(
         tolerance_px: a click this far on the wrong side of its mask's outline is no contradiction.
 
     Raises:
-        StageError: no photo has a good mask from its own clicks.
+        StageError: no photo has a mask that holds clicks in it.
     """
     made: dict[int, Voter] = {}
     left_out: dict[int, list[str]] = {}
+    notes: list[str] = []
 
     def make(k: int, note: str = "") -> None:
         others = {row: voter for row, voter in made.items() if row != k}
@@ -95,16 +97,46 @@ def propagate(
         name, voter = photos.views[k].name, made[k]
         print(f"{name}{note}: quality {voter.quality:.2f}, agreement {voter.agreement:.2f}", flush=True)
 
-    while (following := _next(photos, made, clicked)) is not None:
-        make(following)
+    def make_all() -> None:
+        while (following := _next(photos, made, clicked)) is not None:
+            make(following)
+
+    make_all()
     if not any(voter.votes for voter in made.values()):
-        _refuse(photos, made, left_out)
+        best = max(made, key=lambda k: made[k].agreement)
+        if made[best].agreement <= 0:
+            _refuse(photos, made, left_out)
+        made[best].only = True
+        notes.append(
+            f"the mask of {photos.views[best].name} agrees with {made[best].agreement:.2f} of its clicks, and is used"
+            " since no clicked photo has a better one; look at it, and correct or add clicks"
+        )
+        make_all()
     for k in range(len(photos.views)):
         others = {row: voter for row, voter in made.items() if row != k}
         settled = k in made and made[k].votes and agrees_with_others(photos, k, made[k].mask, others)
         if not settled and not (k in made and made[k].final):
             make(k, " again")
-    return _propagated(photos, made, [note for _, notes in sorted(left_out.items()) for note in notes])
+    for k, voter in made.items():
+        notes += _doubts(photos.views[k].name, voter)
+    return _propagated(photos, made, [said for _, some in sorted(left_out.items()) for said in some], notes)
+
+
+def _doubts(name: str, voter: Voter) -> Iterator[str]:
+    """What may be wrong with the mask of a photo's clicks, a sentence each."""
+    labels = cv2.connectedComponents(voter.mask.astype(np.uint8))[1]
+    u, v = pixel_of(voter.clicks.on, voter.mask)
+    parts = len(set(labels[v, u].tolist()) - {0})
+    if parts > 1:
+        yield (
+            f"the clicks inside in {name} lie on {parts} parts of its mask that do not touch: if they are several"
+            " objects, delete the clicks on all but one"
+        )
+    if voter.final and np.mean(voter.mask) > 0.5:
+        yield (
+            f"the mask from the clicks in {name} covers {np.mean(voter.mask):.0%} of the photo: if it holds what is"
+            " around the object, click outside there"
+        )
 
 
 def _next(photos: Workspace, made: dict[int, Voter], clicked: dict[int, PhotoClicks]) -> int | None:
@@ -174,8 +206,7 @@ def best_mask(
     """The best of the masks for prompts, without the parts of it that hold none, with clicked parts that prompt alone.
 
     A mask that agrees with more clicks is better, whatever its quality. For several clicks alone the largest of those
-    about as good is taken, if the segmenter is certain of none. Where the best is wrong on several known points, well
-    beside its outline, the middle one of these prompts as if a person had clicked on it.
+    about as good is taken, if the segmenter is certain of none.
 
     Args:
         segment: SAM 2 or GrabCut.
@@ -187,38 +218,22 @@ def best_mask(
     Returns:
         The mask (H, W); its quality by the segmenter's own estimate, 0 where it is empty; its agreement.
     """
-    clicks, asked = Prompts(prompts.clicked, prompts.clicked_off), prompts
-    reach_px = max(tolerance_px, NEAR_MISS_SHARE * max(view.height, view.width))
+    clicks = Prompts(prompts.clicked, prompts.clicked_off)
+    reach_px = max(tolerance_px, OUTLINE_BAND_SHARE * max(view.height, view.width))
     found: list[tuple[tuple[float, float], Mask, float]] = []
-    for _ in range(1 + CORRECTIONS):
-        for mask, quality in zip(*segment(view, asked, box)):
-            mask = prompted_parts(cleaned(mask, view.pixels), prompts.inside, prompts.outside)
-            if mask.any():
-                score = agreement(mask, prompts, tolerance_px) + QUALITY_WEIGHT * float(quality)
-                found.append(((agreement(mask, clicks, tolerance_px), score), mask, float(quality)))
-        if not found:
-            return np.zeros((view.height, view.width), dtype=bool), 0.0, 0.0
-        rank, best, quality = max(found, key=lambda one: one[0])
-        missed, taken = _deep(prompts.known, ~best, reach_px), _deep(prompts.known_off, best, reach_px)
-        if not len(missed) and not len(taken):
-            break
-        asked = asked._replace(
-            clicked=np.concatenate([asked.clicked, missed]), clicked_off=np.concatenate([asked.clicked_off, taken])
-        )
+    for mask, quality in zip(*segment(view, prompts, box)):
+        mask = prompted_parts(cleaned(mask, view.pixels), prompts.inside, prompts.outside)
+        if mask.any():
+            score = agreement(mask, prompts, tolerance_px) + QUALITY_WEIGHT * float(quality)
+            found.append(((agreement(mask, clicks, tolerance_px), score), mask, float(quality)))
+    if not found:
+        return np.zeros((view.height, view.width), dtype=bool), 0.0, 0.0
+    rank, best, quality = max(found, key=lambda one: one[0])
     if not len(prompts.known) and len(prompts.clicked) >= SUFFICIENT_CLICKS and quality < CERTAIN_QUALITY:
         alike = [one for one in found if one[0][0] == rank[0] and one[0][1] > rank[1] - SCORE_MARGIN]
         _, best, quality = max(alike, key=lambda one: one[1].sum())
     mask = _with_clicked_parts(segment, view, best, prompts, reach_px)
     return mask, quality, agreement(mask, prompts, tolerance_px)
-
-
-def _deep(pixels: Array, side: Mask, reach_px: float) -> Array:
-    """The middle one, (1, 2), of (N, 2) pixels that lie deeper than this in a side (H, W) of an outline; (0, 2) where
-    there are few: single points may be mismatched."""
-    u, v = pixel_of(pixels, side)
-    wrong = pixels[distance_to(~side)[v, u] > reach_px]
-    middle = np.linalg.norm(wrong - np.median(wrong, axis=0), axis=1).argmin() if len(wrong) else 0
-    return wrong[[middle]] if len(wrong) >= MIN_KNOWN_POINTS else NO_PIXELS
 
 
 def _with_clicked_parts(segment: Segmenter, view: View, mask: Mask, prompts: Prompts, reach_px: float) -> Mask:
@@ -248,7 +263,7 @@ def _refuse(photos: Workspace, made: dict[int, Voter], left_out: dict[int, list[
     raise StageError(f"no clicked photo has a good mask from its clicks ({about}{wrong}); correct or add clicks")
 
 
-def _propagated(photos: Workspace, made: dict[int, Voter], left_out: list[str]) -> Propagated:
+def _propagated(photos: Workspace, made: dict[int, Voter], left_out: list[str], notes: list[str]) -> Propagated:
     """Masks that vote, empty ones for the other photos, and what they say of each point seen in three photos."""
     reasons, masks = {}, []
     for k, view in enumerate(photos.views):
@@ -257,9 +272,10 @@ def _propagated(photos: Workspace, made: dict[int, Voter], left_out: list[str]) 
             reasons[view.name] = (
                 f"the mask from the clicks agrees with {made[k].agreement:.2f} of its prompts (least {MIN_AGREEMENT})"
             )
-    counts = np.bincount(np.concatenate([v.rows for v in made.values() if v.votes]), minlength=len(photos.points))
+    rows = [voter.rows for voter in made.values() if voter.votes]
     kind = known_points(photos, made)
-    kind[counts < 3] = 0
+    counts = np.bincount(np.concatenate(rows), minlength=len(kind))
+    kind[counts < min(CONFIRMING_PHOTOS, len(rows))] = 0
     clicked = {k: voter.clicks for k, voter in made.items() if voter.clicks is not NO_CLICKS}
     quality = {photos.views[k].name: voter.quality for k, voter in sorted(made.items())}
-    return Propagated(masks, reasons, kind, left_out, clicked, quality)
+    return Propagated(masks, reasons, kind, left_out, clicked, quality, notes)

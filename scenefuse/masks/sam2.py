@@ -15,15 +15,13 @@ from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask, mask_iou
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.grabcut import cleaned
-from scenefuse.masks.prompts import NO_PIXELS, Prompts, far_apart
+from scenefuse.masks.prompts import BOX_GROWTH_SHARE, NO_PIXELS, Prompts, far_apart
 from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256, why_unavailable
 from scenefuse.masks.target import Target
 from scenefuse.photos.workspace import View
 
 # Sides of the square image that the network takes, and of the masks that it gives and takes.
 SIDE_PX, LOGITS_PX = 1024, 256
-# Growth of the box around the prompts, as a share of its longer side.
-BOX_GROWTH_SHARE = 0.05
 # Known points that prompt a photo at most: far apart, they say as much as hundreds.
 MAX_POINTS_INSIDE, MAX_POINTS_OUTSIDE = 10, 6
 # Points in the middle of the object that prompt it as well, with the box around all: by points on all its ends and off

@@ -16,9 +16,9 @@ from scenefuse.marks.clicks import Clicks, ScenePoints
 from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks, clicks_per_photo
 from scenefuse.marks.triangulation import marked_size, triangulate_consistent
 from scenefuse.masks.grabcut import along_edges, cleaned, first_cuts, query_grabcut, second_cuts
-from scenefuse.masks.prompts import Segmenter, prompted_parts
+from scenefuse.masks.prompts import Segmenter
 from scenefuse.masks.propagation import propagate
-from scenefuse.masks.sam2 import LOGITS_PX, Sam2, query_sam2, segment
+from scenefuse.masks.sam2 import LOGITS_PX, SIDE_PX, Sam2, query_sam2, segment
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.masks.stereo_points import with_stereo_points
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
@@ -26,7 +26,7 @@ from scenefuse.photos.workspace import View, Workspace, read_model
 
 # Share of the photos that may contradict a voxel of the hull, as some masks are wrong somewhere; the same for GrabCut's
 # first masks, and for another hull by which masks are compared: where many lack a part, they would carve it away.
-MAX_WRONG_SHARE, MAX_WRONG_FIRST_SHARE, MAX_LACKING_SHARE = 0.1, 0.2, 0.34
+MAX_WRONG_SHARE, MAX_LACKING_SHARE = 0.1, 0.34
 # Share of the median mask's agreement with the hull below which SAM 2 makes a mask once more.
 MIN_SHARE_OF_MEDIAN = 0.9
 NOTHING: Mapping[int, PhotoClicks] = {}
@@ -89,7 +89,7 @@ def segment_by_grabcut(
     Clicks, by row of the photo, are certain in their own photo.
     """
     masks = first_cuts(target, photos, settings.grabcut_width_px, clicked)
-    for tolerance in (MAX_WRONG_FIRST_SHARE, MAX_WRONG_SHARE):
+    for tolerance in (MAX_LACKING_SHARE, MAX_WRONG_SHARE):
         hull = carve_consistent(target, photos.views, masks, settings, tolerance)
         masks = second_cuts(target, masks, photos, hull, clicked)
     return masks
@@ -129,7 +129,7 @@ def _at_full_size(view: View, mask: Mask) -> Mask:
     """A mask (H, W) at its photo's resolution. Small parts of it stay: they were asked for, by a click or by points of
     other photos; small parts that the edges leave do not."""
     assert view.pixels is not None
-    edges = along_edges(view.pixels, mask, max(view.width, view.height) / LOGITS_PX)
+    edges = along_edges(view.pixels, mask, max(view.width, view.height) / LOGITS_PX, SIDE_PX)
     asked = mask & ~cleaned(mask)
     return np.asarray(cleaned(edges, view.pixels) | (edges & asked))
 
@@ -156,7 +156,7 @@ def carve_consistent(
     """The visual hull of the largest set of masks (H, W) that agree with the hull of their set.
 
     A strict hull of all masks is too small where some lack a part, a tolerant one too large where few photos bound it;
-    the set that begins with the one or the other is taken.
+    the set that begins with the one or the other is taken, and all masks where no two agree.
 
     Raises:
         StageError: the masks have nothing in common.
@@ -176,8 +176,8 @@ def carve_consistent(
         chosen = agreeing(carved(shown, coarse, share)) if len(shown) > 1 else []
         consistent = agreeing(carved(chosen, coarse, tolerance)) if len(chosen) > 1 else []
         largest = max(largest, consistent, key=len)
-    hull = carved(largest, settings.hull_voxels, tolerance) if len(largest) > 1 else None
-    if hull is None or len(hull.shell) == 0:
+    hull = carved(largest if len(largest) > 1 else shown, settings.hull_voxels, tolerance)
+    if len(hull.shell) == 0:
         raise StageError(
             "the masks of the photos have no common object; check that the prompts lie on one object and span it, "
             "or supply masks"
@@ -188,9 +188,6 @@ def carve_consistent(
 # Clicks on a point that miss each other by this share of what is clicked still say where the object ends: corners that
 # a hand misses, or that are none (a hat's brim).
 MAX_MISS_SHARE = 0.03
-# GrabCut propagates masks in photos so many times as wide as those of its first cut: what one mask lacks is missing
-# from the next.
-PROPAGATION_WIDTHS = 2
 
 
 @dataclass(frozen=True)
@@ -243,8 +240,8 @@ def masks_from_prompts(
     """
     if isinstance(marked, Clicks) and marked.kind == "labels":
         own, left_out = clicks_per_photo(marked, sparse, photos.views, sizes)
-        width_px = PROPAGATION_WIDTHS * settings.grabcut_width_px
-        segment: Segmenter = partial(query_sam2, network) if network else partial(query_grabcut, width_px)
+        cut: Segmenter = partial(query_grabcut, settings.grabcut_width_px)
+        segment = partial(query_sam2, network) if network else cut
         photos = with_stereo_points(photos) if network else photos
         found = propagate(segment, photos, own, settings.max_click_residual_px)
         target = target_from_votes(found.kind, photos, up, seed)
@@ -252,26 +249,14 @@ def masks_from_prompts(
             masks = segment_again(network, target, found.masks, photos, settings, found.clicked)
         else:
             masks = segment_by_grabcut(target, photos, settings, found.clicked)
-        masks = [_own_parts(mask, target, photos, k, found.clicked.get(k)) for k, mask in enumerate(masks)]
         names = tuple(photos.views[k].name for k, clicks in found.clicked.items() if clicks.enough)
         left_out += found.left_out
-        return Prompted(masks, target, found.reasons, left_out, clicked=names, quality=found.quality)
+        return Prompted(masks, target, found.reasons, left_out, tuple(found.notes), names, found.quality)
     points, exact, left_out, notes = _points(marked, sparse, sizes, settings.max_click_residual_px)
     target = replace(target_from_points(points, photos, up, seed), inexact=np.flatnonzero(~exact))
     if network:
         return Prompted(segment_by_sam2(network, target, photos, settings), target, {}, left_out, notes)
     return Prompted(segment_by_grabcut(target, photos, settings), target, {}, left_out, notes)
-
-
-def _own_parts(mask: Mask, target: Target, photos: Workspace, k: int, clicks: PhotoClicks | None) -> Mask:
-    """The parts of a photo's mask that hold a click, or a sparse point that is the object's: seen, or hidden by it."""
-    at, kind = photos.seen_at[k], target.kind[photos.seen[k]]
-    hidden, depth = photos.views[k].project(target.spanning)
-    shown = (depth > 0) & (hidden >= 0).all(1) & (hidden < mask.shape[::-1]).all(1)
-    on, off = [at[kind > 0], hidden[shown]], [at[kind < 0]]
-    if clicks is not None:
-        on, off = [*on, clicks.on], [*off, clicks.off]
-    return prompted_parts(mask, np.concatenate(on), np.concatenate(off))
 
 
 def _points(

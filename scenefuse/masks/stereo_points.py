@@ -9,6 +9,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import back_project
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
+from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.mvs.view_selection import select_views
 from scenefuse.photos.workspace import Rows, View, Workspace
 
@@ -16,8 +17,8 @@ from scenefuse.photos.workspace import Rows, View, Workspace
 SETTINGS = DepthMapSettings(max_image_size_px=200, sources=4, planes=64, window_px=5, min_score=0.6)
 # Photos of that size get a point in each square of so many pixels in which they see none.
 CELL_PX = 3
-# Relative difference of depths that agree, and photos whose depths agree on a point.
-MAX_DEPTH_DIFFERENCE, MIN_PHOTOS = 0.01, 3
+# Relative difference of depths that agree.
+MAX_DEPTH_DIFFERENCE = 0.01
 
 DepthMap = NDArray[np.float32]
 
@@ -45,7 +46,7 @@ def with_stereo_points(photos: Workspace) -> Workspace:
         agree = np.zeros(len(new), dtype=np.int64)
         for other in maps:
             agree[_shown(*other, new)] += 1
-        points = np.concatenate([points, new[agree >= MIN_PHOTOS]])
+        points = np.concatenate([points, new[agree >= CONFIRMING_PHOTOS]])
     count = len(photos.points)
     print(f"{len(points) - count} points by stereo beside {count} sparse ones", flush=True)
     seen, seen_at = list(photos.seen), list(photos.seen_at)

@@ -12,13 +12,12 @@ from scenefuse.core.transforms import Array
 from scenefuse.geometry.ground import Ground, fit_ground
 from scenefuse.geometry.visual_hull import NO_POINTS, Box
 from scenefuse.masks.prompts import far_apart
+from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.photos.workspace import View, Workspace
 
-# Growth of the box of the object's points on each side, as a share of its diagonal: they seldom mark its ends.
+# Growth of the box of the object's points on each side, as a share of its diagonal: they seldom mark its ends. Prompts
+# no farther apart enclose a part: close clicks mark the corners of a small one.
 BOX_MARGIN_SHARE = 0.15
-# Longest edge between prompts that enclose a part of the object, as a share of the box's diagonal: close clicks mark
-# the corners of a small part.
-MAX_PART_EDGE_SHARE = 0.12
 # Sparse points, far apart, that stand for the object where masks voted for thousands.
 SPANNING_POINTS = 64
 # Ground is looked for so far beside the box, in half widths of it: farther off it may be another level.
@@ -90,8 +89,8 @@ def target_from_points(points: Array, photos: Workspace, up: Array, seed: int) -
     if found:
         kind[height < 0.5 * above] = -1
     kind[in_hull(sparse, span(points, 0.25 * grow)) & (height > above)] = 1
-    kind[np.bincount(np.concatenate(photos.seen), minlength=len(sparse)) < 3] = 0
-    return Target(box, ground, found, points, grow, _parts(points, MAX_PART_EDGE_SHARE * box.diagonal), sparse, kind)
+    kind[np.bincount(np.concatenate(photos.seen), minlength=len(sparse)) < CONFIRMING_PHOTOS] = 0
+    return Target(box, ground, found, points, grow, _parts(points, BOX_MARGIN_SHARE * box.diagonal), sparse, kind)
 
 
 def target_from_votes(

@@ -13,14 +13,13 @@ from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.prompts import POINT_RADIUS_SHARE, Prompts, agreement, distance_to, pixel_of
 from scenefuse.masks.target import MIN_OBJECT_POINTS, in_hull, without_outermost
+from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.photos.workspace import Workspace
 
 # Points that a photo, or a click outside, is known by.
 MIN_KNOWN_POINTS = 4
 # Agreement of a mask with its prompts from which it votes, and of the votes on a point from which it is known.
 MIN_AGREEMENT = 0.8
-# Points on which so many photos vote span the object: a single mask may hold what is around it.
-SPANNING_PHOTOS = 2
 
 
 @dataclass
@@ -35,6 +34,7 @@ class Voter:
         inside: (N,) whether they are the object's.
         clicks: those in this photo that the mask agrees with.
         denied: sparse points that each click outside says not to be the object's, the nearest to it first.
+        only: whether no clicked photo has a better mask: then it counts although it contradicts some clicks.
     """
 
     mask: Mask
@@ -44,11 +44,12 @@ class Voter:
     inside: NDArray[np.bool_]
     clicks: PhotoClicks
     denied: list[NDArray[np.int64]] = field(default_factory=list)
+    only: bool = False
 
     @property
     def votes(self) -> bool:
         """Whether it counts."""
-        return self.quality > 0 and self.agreement >= MIN_AGREEMENT
+        return self.quality > 0 and (self.only or self.agreement >= MIN_AGREEMENT)
 
     @property
     def final(self) -> bool:
@@ -101,7 +102,7 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> NDArray[np.int8]:
     known = np.where(share >= MIN_AGREEMENT, 1, np.where(share <= 1 - MIN_AGREEMENT, -1, 0)).astype(np.int8)
     rows = [voter.rows for voter in made.values() if voter.votes]
     counts = np.bincount(np.concatenate([np.zeros(0, np.int64), *rows]), minlength=len(known))
-    own = without_outermost(photos.points[(known > 0) & (counts >= SPANNING_PHOTOS)])
+    own = without_outermost(photos.points[(known > 0) & (counts >= CONFIRMING_PHOTOS)])
     if len(own) >= MIN_OBJECT_POINTS:
         with suppress(QhullError):  # of points in a plane, which enclose nothing
             known[(known < 0) & in_hull(photos.points, own)] = 0

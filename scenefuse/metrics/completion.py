@@ -16,8 +16,6 @@ from scenefuse.core.transforms import Array
 from scenefuse.register.agreement import NORMAL_NEIGHBOURS, AgreementSettings
 
 MEASURES = ("surface_variation", "nue", "nue_density_invariant", "primitive_fitting_score")
-# Points whose neighbourhoods are held in memory together: a fine object's hold thousands of points each.
-NEIGHBOURHOODS_AT_ONCE = 200
 # Candidates for a primitive, of each kind, in a round.
 CANDIDATES = 150
 Mask = NDArray[np.bool_]
@@ -186,10 +184,8 @@ def surface_variation(cloud: Array, at: Array, radius: float) -> float | None:
         radius: of a neighbourhood, in the clouds' unit.
     """
     tree = cKDTree(cloud)
-    parts = [
-        _variations(tree, at[start : start + NEIGHBOURHOODS_AT_ONCE], radius)
-        for start in range(0, len(at), NEIGHBOURHOODS_AT_ONCE)
-    ]
+    # At a time few: a fine object's neighbourhoods hold thousands of points each.
+    parts = [_variations(tree, at[start : start + 200], radius) for start in range(0, len(at), 200)]
     found = np.concatenate(parts) if parts else np.empty(0)
     return float(found.mean()) if len(found) else None
 

@@ -18,20 +18,19 @@ from scenefuse.nerf.render import Occupancy, render_view
 
 # Colours of a place are compared in photos shrunk to at most this width: depths need not be exact to a pixel for it.
 SMALL_PX = 96
-RENDER_SAMPLES = 32
-# A place is compared in the photos taken nearest to the one it is found in, where both show it: depths differ by less
-# than this share.
-COMPARED_PHOTOS, MAX_DEPTH_DIFFERENCE = 24, 0.02
+# A place is compared in the photos taken nearest to the one it is found in, where both show it.
+COMPARED_PHOTOS = 24
+# Depths that differ by this share are of two surfaces: no slanted one has such a step.
+DEPTH_JUMP = 0.03
 MIN_OPACITY = 0.9
-# Darker pixels are mostly noise, and brighter ones mostly clipped.
-MIN_COLOR, MAX_COLOR = 0.04, 0.98
+# Pixels nearer to black are mostly noise, and nearer to white mostly clipped.
+COLOR_MARGIN = 0.03
 # Logarithms of colours that differ by more than this are a highlight, a shadow or another surface.
 LOG_DELTA = 0.05
-ROUNDS = 10
 # A photo that was not trained on is taken to have the gains of so many that were taken nearest to it.
 GAIN_NEIGHBOURS = 2
-# Sharpness compares details finer than the first Gaussian's sigma with those between the two, in pixels.
-FINE_PX, COARSE_PX = 1.0, 3.0
+# Sharpness compares details finer than a Gaussian's sigma of one pixel with those between it and this one.
+COARSE_PX = 3.0
 # A photo is blurred with less than this share of the median sharpness of those that it is compared with.
 MIN_SHARPNESS_SHARE = 0.7
 
@@ -69,7 +68,7 @@ class SharedColors:
     difference: Tensor
 
 
-def find_appearance(field: Field, occupancy: Occupancy, photos: PhotoTensors) -> Appearance:
+def find_appearance(field: Field, occupancy: Occupancy, photos: PhotoTensors, samples: int) -> Appearance:
     """Gains and vignetting from the places that several photos show, as the field's depths have them.
 
     The field's own colours are not used: they depend on the direction of view, and could take over whatever differs
@@ -77,7 +76,7 @@ def find_appearance(field: Field, occupancy: Occupancy, photos: PhotoTensors) ->
     """
     small = shrunk(photos)
     views = [
-        render_view(field, occupancy, small.camera(view), mask, RENDER_SAMPLES, colored=False)
+        render_view(field, occupancy, small.camera(view), mask, samples, colored=False)
         for view, mask in enumerate(small.masks)
     ]
     depths = torch.stack([torch.where(view.opacity > MIN_OPACITY, view.depth, 0.0) for view in views])
@@ -121,8 +120,8 @@ def _shared(photos: PhotoTensors, depths: Tensor, a: int, b: int) -> tuple[Tenso
     u, v = (there[:, axis].clamp(0, size - 1).long() for axis, size in ((0, width), (1, height)))
     ours, theirs = (photos.images[view, y, x] / 255.0 for view, y, x in ((a, rows, columns), (b, v, u)))
     kept = (x[:, 2] > 0) & ((there > 0) & (there < torch.tensor([width, height]))).all(1)
-    kept &= (depths[b, v, u] - x[:, 2]).abs() < MAX_DEPTH_DIFFERENCE * x[:, 2]
-    kept &= (torch.minimum(ours, theirs) > MIN_COLOR).all(1) & (torch.maximum(ours, theirs) < MAX_COLOR).all(1)
+    kept &= (depths[b, v, u] - x[:, 2]).abs() < DEPTH_JUMP * x[:, 2]
+    kept &= ((torch.stack([ours, theirs]) - 0.5).abs() < 0.5 - COLOR_MARGIN).all(2).all(0)
     radius2 = [squared_radius(p, k.expand(len(p), 3, 3), width, height) for p, k in ((uv, k_a), (there, k_b))]
     index = torch.ones(int(kept.sum()), dtype=torch.int64)
     return index * a, index * b, torch.stack(radius2, 1)[kept], (ours[kept] / theirs[kept]).log()
@@ -139,7 +138,7 @@ def solved(shared: SharedColors, photos: int) -> Appearance:
     difference = shared.difference.double()
     pairs = torch.bincount(a, minlength=photos) + torch.bincount(b, minlength=photos)
     log_gain, falloff = torch.zeros(photos, 3, dtype=torch.float64), torch.zeros((), dtype=torch.float64)
-    for _ in range(ROUNDS):
+    for _ in range(10):
         left = difference - (log_gain[a] - log_gain[b]) - (falloff * radial)[:, None]
         weight = (LOG_DELTA / left.abs().amax(1).clamp(min=1e-9)).clamp(max=1.0)
         log_gain = _gains(a, b, weight, difference - (falloff * radial)[:, None], 1e-3 * pairs.clamp(min=1))
@@ -189,7 +188,7 @@ def fitted_log_gain(rendered: Tensor, photo: Tensor) -> Tensor:
     gain = torch.ones(3, dtype=torch.float64)
     c, p = rendered.double(), photo.double()
     ridge = 1e-4 * max(len(c), 1)
-    for _ in range(ROUNDS):
+    for _ in range(10):
         weight = (COLOR_DELTA / (gain * c - p).abs().clamp(min=1e-9)).clamp(max=1.0)
         gain = ((weight * c * p).sum(0) + ridge) / ((weight * c * c).sum(0) + ridge)
     return gain.log().float()
@@ -244,7 +243,7 @@ def measured_sharpness(images: Tensor, masks: Tensor) -> Tensor:
         if mask.sum() < 2:
             continue
         gray = image.float().mean(2)
-        smooth = _blurred(gray, FINE_PX)
+        smooth = _blurred(gray, 1.0)
         found[index] = (gray - smooth)[mask].std() / (smooth - _blurred(gray, COARSE_PX))[mask].std().clamp(min=1e-6)
     return torch.where(found.isnan(), found.nanmedian().nan_to_num(1.0), found)
 

@@ -161,10 +161,6 @@ def spherical_harmonics(direction: Tensor) -> Tensor:
     )
 
 
-# exp(11) in a unit cube is opaque within a ten-thousandth of its side; beyond it gradients overflow.
-MAX_LOG_DENSITY = 11.0
-
-
 @dataclass(frozen=True)
 class FieldSettings:
     """Size of the radiance field."""
@@ -209,7 +205,8 @@ class Field(nn.Module):
         inside = x.clamp(0.0, 1.0 - 1e-6)
         features = encode(inside, self.table, self.grid, self.level_weight)
         out = self.density_out(torch.relu(self.density_in(features)))
-        return torch.exp(out[:, 0].clamp(max=MAX_LOG_DENSITY)), out
+        # exp(11) in a unit cube is opaque within a ten-thousandth of its side; beyond it gradients overflow.
+        return torch.exp(out[:, 0].clamp(max=11.0)), out
 
     def color(self, features: Tensor, direction: Tensor) -> Tensor:
         """RGB (R, S, 3) in 0..1 from features (R S, 16) of S samples on each of R rays with unit directions (R, 3)."""

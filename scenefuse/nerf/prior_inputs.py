@@ -28,8 +28,6 @@ PERCENTILES = (1, 99)
 RANGE_MARGIN = 0.15
 # Kept around a mask's box, share of the box: windows and warps at the outline need pixels beyond it.
 MARGIN = 0.06
-# The network halves its maps four times.
-MIN_CANVAS_PX = 32
 # As for a scene's photos (M7), with smaller windows, because the cut photos are small.
 STEREO = DepthMapSettings(sources=6, best_sources=2, window_px=5)
 # Matching score at which stereo and SfM points count the same.
@@ -76,7 +74,8 @@ def crop_to_object(views: Views, crop_px: int) -> Crops:
     aspect = float(np.median(extent[:, 0] / extent[:, 1]))
     ideal = np.array([crop_px * aspect**0.5, crop_px / aspect**0.5])
     largest = np.minimum(np.minimum(ideal, extent.max(0)), [width, height])
-    canvas = np.maximum(np.ceil(largest / 4) * 4, MIN_CANVAS_PX).astype(int)
+    # The network halves its maps four times.
+    canvas = np.maximum(np.ceil(largest / 4) * 4, 2 * 2**4).astype(int)
     pictures: tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8]]] = ([], [])
     intrinsics, moves = [], []
     for index, box in enumerate(boxes):

@@ -40,10 +40,6 @@ SOURCES_PER_STEP = 3
 SMOOTHNESS_WEIGHT = 1e-3
 # Relative depth errors are squared below the first of these, and count no more beyond the second.
 SQUARED_ERROR, MAX_ERROR = 0.005, 0.1
-# The first part of the training compares photos at half size, where wrong depths still find their way.
-COARSE_SHARE = 0.3
-# Share of a half-size pixel that is object, for it to count.
-MIN_OBJECT_SHARE = 0.75
 
 # The losses of (B,) chosen photos at a step, by name; the generator draws what is random.
 Objective = Callable[[Tensor, int, torch.Generator], dict[str, Tensor]]
@@ -88,11 +84,11 @@ def train_network(
         StageError: the training diverged.
     """
     points, weights = _padded(photos)
-    scales = [PhotoScale(photos, shrink) for shrink in (2, 1)]
-    coarse = COARSE_SHARE * recipe.steps(photos)
+    # Half of the training compares photos at half size, where wrong depths still find their way.
+    scales, steps = [PhotoScale(photos, shrink) for shrink in (2, 1)], recipe.steps(photos)
 
     def losses(chosen: Tensor, step: int, generator: torch.Generator) -> dict[str, Tensor]:
-        scale = scales[0] if step < coarse else scales[1]
+        scale = scales[step * len(scales) // steps]
         disparity = network(inputs.channels[chosen], inputs.first[chosen])
         depth = depth_from_disparity(disparity, photos.near, photos.far)
         available = photos.sources.shape[1]
@@ -176,7 +172,7 @@ class PhotoScale:
     def __init__(self, photos: DepthPhotos, shrink: int) -> None:
         self.shrink = shrink
         self.images = self.pool(photos.images)
-        self.masks = (self.pool(photos.masks) > MIN_OBJECT_SHARE).to(photos.masks.dtype)
+        self.masks = (self.pool(photos.masks) > 0.5).to(photos.masks.dtype)
         self.intrinsics = photos.intrinsics.clone()
         self.intrinsics[:, :2] /= shrink
         self.unmoved = torch.cat([photometric_error(self.images, self.images[of]) for of in photos.sources.T], 1)

@@ -12,6 +12,8 @@ from torch.nn.functional import max_pool2d
 RING_PX = 12
 # Share of a photo's rays that are drawn beside the object: they teach that nothing is there.
 OUTSIDE_SHARE = 0.1
+# Samples and depths of one surface lie this near each other along a ray, as a share of the cube's side.
+SURFACE_DEPTH = 0.05
 # A mask that the ignored band would leave less than this share of is drawn from as a whole: it is thin everywhere.
 THIN_SHARE = 0.2
 

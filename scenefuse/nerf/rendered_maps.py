@@ -12,8 +12,8 @@ from torch import Tensor
 from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.consistency import normals_from_depth
-from scenefuse.nerf.appearance import MIN_OPACITY, falloff_map, fitted_log_gain, gains_nearby
-from scenefuse.nerf.rays import PhotoTensors, dilate
+from scenefuse.nerf.appearance import DEPTH_JUMP, MIN_OPACITY, falloff_map, fitted_log_gain, gains_nearby
+from scenefuse.nerf.rays import SURFACE_DEPTH, PhotoTensors, dilate
 from scenefuse.nerf.refine_depth import CONFIRMING_VIEWS, MAP_AGREEMENT, agreement
 from scenefuse.nerf.render import RenderedView, render_view
 from scenefuse.nerf.training import Nerf
@@ -25,10 +25,8 @@ Maps = NDArray[np.float32]
 # Views are rendered so far beyond their masks: what the object shows beyond them counts against it. Windows of 11
 # pixels, in which structural similarity is measured, reach as far.
 BEYOND_MASK_PX = 5
-# A rendered depth counts where the ray is opaque and its weights lie within a few hundredths of the cube (method N13).
-MAX_DEVIATION = 0.05
-# Normals come from depths so many pixels apart, unless these jump: by more than this share, no slanted surface does.
-NORMAL_STEP_PX, DEPTH_JUMP = 2, 0.03
+# Normals come from depths so many pixels apart, unless these jump.
+NORMAL_STEP_PX = 2
 
 
 @dataclass(frozen=True)
@@ -245,5 +243,5 @@ def silhouette_iou(opacity: Tensor, mask: Tensor) -> float:
 
 def _solid_depth(rendered: RenderedView) -> Tensor:
     """(H, W) median depth, 0 where the ray is not opaque or its weights are spread."""
-    keep = (rendered.opacity > MIN_OPACITY) & (rendered.deviation < MAX_DEVIATION)
+    keep = (rendered.opacity > MIN_OPACITY) & (rendered.deviation < SURFACE_DEPTH)
     return torch.where(keep, rendered.depth, torch.zeros_like(rendered.depth))

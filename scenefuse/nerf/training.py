@@ -27,18 +27,11 @@ from scenefuse.nerf import losses
 from scenefuse.nerf.appearance import Appearance, find_appearance, squared_radius
 from scenefuse.nerf.field import Field, FieldSettings, coarse_to_fine
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.rays import PhotoTensors, PixelPool, RayBatch, camera_rays, draw_batch, pixel_pool
+from scenefuse.nerf.rays import SURFACE_DEPTH, PhotoTensors, PixelPool, RayBatch, camera_rays, draw_batch, pixel_pool
 from scenefuse.nerf.render import UNIFORM_SHARE, Composited, Occupancy, RayPrior, RaySamples, composite, march, updated
 
 # Steps between updates of the grid (Mueller et al. 2022, appendix E.2).
 OCCUPANCY_EVERY = 16
-# The cosine ends at this share of the highest rate, not at nothing: the last steps still learn.
-FINAL_RATE_SHARE = 0.02
-# Gains and vignetting are found at these shares of a training: when depths are good enough to compare photos by, and
-# again when they are better. A warm training finds them at its start too.
-APPEARANCE_AT = (0.15, 0.4)
-# Samples near a prior's surface lie within this distance of it.
-PRIOR_HALF_WIDTH = 0.04
 
 
 @dataclass(frozen=True)
@@ -278,9 +271,10 @@ def _prepare(nerf: Nerf, training: Training, step: int) -> None:
         coarse_to_fine(nerf.field, progress, training.recipe.coarse_until)
     if step % OCCUPANCY_EVERY == 0 and (step or training.warm):
         nerf.occupancy = updated(nerf.occupancy, nerf.field, training.seed, step)
-    due = step in {round(share * training.steps) for share in APPEARANCE_AT} or (step == 0 and training.warm)
-    if due and training.recipe.appearance:
-        nerf.appearance = find_appearance(nerf.field, nerf.occupancy, training.photos)
+    # Photos are compared by depths, which are good once all levels are open.
+    due = 0 if training.warm else round(training.recipe.coarse_until * training.steps)
+    if step == due and training.recipe.appearance:
+        nerf.appearance = find_appearance(nerf.field, nerf.occupancy, training.photos, training.recipe.samples)
 
 
 def _draw(training: Training, pool: PixelPool, step: int, device: torch.device) -> RayBatch:
@@ -296,7 +290,7 @@ def _descend(
     added = training.additions
     weights = {**training.weights.by_name(), **({} if added is None else added.weights)}
     torch.stack([weights[name] * term for name, term in terms.items() if name != "psnr"]).sum().backward()
-    factor = learning_rate_factor(step, training.steps, training.warmup_steps, FINAL_RATE_SHARE)
+    factor = learning_rate_factor(step, training.steps, training.warmup_steps)
     rates = training.recipe.grid_learning_rate, training.recipe.learning_rate
     for group, rate in zip(optimizer.param_groups, rates):
         group["lr"] = rate * factor
@@ -334,7 +328,7 @@ def _rays(photos: PhotoTensors, batch: RayBatch, prior_share: float) -> Rays:
     )
     origin, direction, length = camera_rays(intrinsics, rotation, center, batch.uv)
     confidence = batch.confidence * ((batch.depth > 0) & batch.inside)
-    prior = RayPrior(batch.depth * length, torch.full_like(length, PRIOR_HALF_WIDTH), prior_share * confidence)
+    prior = RayPrior(batch.depth * length, torch.full_like(length, SURFACE_DEPTH), prior_share * confidence)
     return Rays(origin, direction, length, prior, confidence)
 
 

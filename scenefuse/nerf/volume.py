@@ -19,22 +19,13 @@ from scenefuse.geometry.visual_hull import (
     least_framing,
 )
 from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
-from scenefuse.nerf.rays import dilate
+from scenefuse.nerf.rays import SURFACE_DEPTH, dilate
 from scenefuse.photos.workspace import View
 
-# Cells per side of the hull that the cube is fitted to: the margin is wider than one of them.
-FIRST_CELLS = 64
-# Share of the cube's side left free on each side of the hull, for what the masks cut off.
-MARGIN = 0.02
 # Share of the photos that must frame a cell, more than masks need: what few photos bound is large, and costs rays.
 MIN_FRAMING_SHARE = 0.3
 # The first, rough cube is wider by this share on each side than the masks' extents ask for, or the object's own points.
 ROUGH_MARGIN = 0.25
-# Photos that show a cell, from which on one may miss it, however small the tolerance: a single mask may lack a part.
-TOLERANT_PHOTOS = 12
-# Three photos must have a cell on the mask, no deeper behind the surface than this share of the cube's side, where some
-# have it behind the surroundings: what lies behind these and the object is no part of it that one could see.
-MAX_DEPTH_BEHIND = 0.05
 
 
 @dataclass(frozen=True)
@@ -63,7 +54,8 @@ def find_volume(
     try:
         if cube is None:
             rough = _rough_cube([outline.view for outline in outlines], own)
-            cube = tight_cube(visual_hull(outlines, rough, FIRST_CELLS, tolerance, own), rough, MARGIN)
+            # One of the coarse cells is left free on each side of the hull, for what the masks cut off.
+            cube = tight_cube(visual_hull(outlines, rough, cells // 2, tolerance, own), rough, 2 / cells)
         hull = visual_hull(outlines, cube, cells, tolerance, own)
     except ValueError as error:
         raise StageError(f"no volume for the object: {error}; check the masks and the cameras") from None
@@ -190,7 +182,7 @@ def visual_hull(
         outlines: of the photos.
         unit_from_object: the cube.
         size: cells per side, a multiple of 4 times a power of 2.
-        tolerance: share of the photos that may have a cell outside their mask; one of twelve or more may.
+        tolerance: share of the photos that may have a cell outside their mask, rounded to a number of photos.
         own: (N, 3) points on the object.
     """
     object_from_unit = unit_from_object.inverse()
@@ -201,10 +193,12 @@ def visual_hull(
         points = object_from_unit.apply((cells + 0.5) / count)
         reach = _reach(object_from_unit, count)
         grown = (_grown(outline, points, reach) for outline in outlines)
-        found = count_silhouettes(points, grown, object_from_unit.scale * MAX_DEPTH_BEHIND)
+        # Three photos must have a cell on the mask, not deep behind the surface, where some have it behind the
+        # surroundings: what lies behind these and the object is no part of it that one could see.
+        found = count_silhouettes(points, grown, object_from_unit.scale * SURFACE_DEPTH)
         # Of a coarse cell that is hidden one part may be in sight.
         shown = found.shown + (found.hidden if count < size else 0)
-        kept = (found.missed <= np.maximum(tolerance * shown, shown >= TOLERANT_PHOTOS)) & (shown >= quorum)
+        kept = (found.missed <= np.round(tolerance * shown)) & (shown >= quorum)
         if count == size:
             kept &= (found.hidden == 0) | (found.open >= CONFIRMING_PHOTOS)
         cells = cells[kept]

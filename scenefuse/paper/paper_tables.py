@@ -1,5 +1,7 @@
 """Tables 2 to 4 of the paper for one object: its own numbers, runs of this workflow and chance; one definition each."""
 
+import csv
+import importlib.resources
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,31 +21,13 @@ COMMON = "scenefuse, on the preset's crop"
 NULL = "null"
 VARIANTS = ("full", "no_scale", "no_crop")
 """The registration of the paper's Tables 2 and 3, and those of its ablation, Table 4."""
-# What the paper published in these tables, of its own captures, whose objects the demo's are named after.
-OBJECTS = ("house", "balloon", "sculpture")
-# By measure and registration variant, in the order of OBJECTS. RMSE is in metres; no diagonal is given to divide it by.
-PUBLISHED = {
-    ("fitness", "full"): (0.9302, 0.9916, 0.9207),
-    ("inlier_rmse", "full"): (0.0852, 0.0096, 0.0348),
-    ("normal_consistency", "full"): (0.6023, 0.6210, 0.7948),
-    ("surface_variation", "full"): (0.1597, 0.1897, 0.1219),
-    ("nue", "full"): (1.17, 1.29, 1.21),
-    ("primitive_fitting_score", "full"): (0.9984, 0.9954, 0.9975),
-    ("fitness", "no_scale"): (0.3083, 0.0820, 0.3085),
-    ("inlier_rmse", "no_scale"): (0.2614, 0.1810, 0.3724),
-    ("normal_consistency", "no_scale"): (0.4448, 0.2196, 0.4834),
-    ("fitness", "no_crop"): (0.4129, 0.5876, 0.3621),
-    ("inlier_rmse", "no_crop"): (0.4424, 0.1804, 0.0655),
-    ("normal_consistency", "no_crop"): (0.3056, 0.5695, 0.7373),
-}
+ASSETS = importlib.resources.files("scenefuse.paper") / "assets"
 
 
-def published(name: str) -> dict[tuple[str, str], tuple[float, str]]:
-    """Value and unit by measure and variant of an object of the paper's; nothing of any other."""
-    if name not in OBJECTS:
-        return {}
-    place = OBJECTS.index(name)
-    return {key: (values[place], "m" if key[0] == "inlier_rmse" else "1") for key, values in PUBLISHED.items()}
+def _rows_of(name: str) -> list[dict[str, str]]:
+    """The rows of a table in assets/."""
+    with (ASSETS / name).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file, delimiter="\t"))
 
 
 @dataclass(frozen=True)
@@ -63,48 +47,27 @@ class Measure:
     group: str
 
 
-_FITNESS = (
-    f"share of the crop's points with a point of the object within tau, {AgreementSettings().tau_fraction:.1%} of the"
-    " crop's diagonal; higher is better (R10, R11)"
-)
-_RMSE = (
-    "RMS distance to the crop of the object's points (not the crop's, as in fitness) that lie within tau of it; lower"
-    " is better (R10, R11)"
-)
-_RMSE_SHARE = "inlier_rmse over the diagonal of the crop, so that objects of any size compare; lower is better (R11)"
-_NORMALS = (
-    "mean |n . n_nearest| between the object's points that lie within tau of the crop and the crop's nearest to them;"
-    " higher is better, 0.5 is of unrelated normals (G1)"
-)
-_VARIATION = (
-    "mean over the added points of the smallest eigenvalue of the covariance of their neighbours (within"
-    " metrics.variation_spacings of the crop's spacings) over the sum of all three; 0 to 1/3, lower is better (G2)"
-)
-_DENSITY = "density (k over the area of the circle to the k-th neighbour, k = metrics.density_neighbours)"
-_NUE = f"standard deviation of the {_DENSITY} of the completed cloud over that of the crop; near 1 is better (G3, G4)"
-_NUE_INVARIANT = "as nue, each standard deviation over its mean: what is denser everywhere has the same (G4)"
-_PRIMITIVES = (
-    "share of the added points that lie within metrics.primitive_fraction of the crop's diagonal on planes, spheres or"
-    " cylinders, at most metrics.primitive_most, of metrics.primitive_support of the points at least; higher is better"
-    " (G5)"
-)
-REGISTRATION = (
-    Measure("fitness", "Fitness", _FITNESS, "registration"),
-    Measure("inlier_rmse", "Inlier RMSE", _RMSE, "registration"),
-    Measure("inlier_rmse_over_diagonal", "not in the paper", _RMSE_SHARE, "registration"),
-    Measure("normal_consistency", "Normal Consistency", _NORMALS, "registration"),
-)
-COMPLETION = (
-    Measure("surface_variation", "Geometric Smoothness", _VARIATION, "completion"),
-    Measure("nue", "Distribution Uniformity", _NUE, "completion"),
-    Measure("nue_density_invariant", "not in the paper", _NUE_INVARIANT, "completion"),
-    Measure("primitive_fitting_score", "Structural Plausibility", _PRIMITIVES, "completion"),
-)
-_TABLES = {2: (REGISTRATION, VARIANTS[:1]), 3: (COMPLETION, VARIANTS[:1]), 4: (REGISTRATION, VARIANTS[1:])}
-ROWS = [(n, variant, m) for n, (measures, variants) in _TABLES.items() for variant in variants for m in measures]
-"""Number of the table, variant and measure of each row."""
+_TAU = AgreementSettings().tau_fraction
+MEASURES = {
+    row["measure"]: Measure(row["measure"], row["in_paper"], row["definition"].format(tau=_TAU), row["group"])
+    for row in _rows_of("measures.tsv")
+}
+# Number of the table, variant and measure of each row; and what the paper published there of its own captures, whose
+# objects the demo's are named after. RMSE is in metres; no diagonal is given to divide it by.
+PUBLISHED = _rows_of("published.tsv")
+ROWS = [(int(row["table"]), row["variant"], MEASURES[row["measure"]]) for row in PUBLISHED]
+OBJECTS = ("house", "balloon", "sculpture")
 # Why a number of a run that has come so far may be missing, by group.
 _NOTHING = {"registration": "no point of the object within tau", "completion": "too few points were added"}
+
+
+def published(name: str) -> dict[tuple[str, str], tuple[float, str]]:
+    """Value and unit by measure and variant of an object of the paper's; nothing of any other."""
+    return {
+        (row["measure"], row["variant"]): (float(row[name]), "m" if row["measure"] == "inlier_rmse" else "1")
+        for row in PUBLISHED
+        if row.get(name) and name in OBJECTS
+    }
 
 
 @dataclass(frozen=True)
@@ -196,7 +159,7 @@ def on_crop_of(folder: Path, item: ObjectSummary, its_folder: Path, here_from_th
 
 def _measured(fields: Fields, ending: str = "") -> Fields:
     """The paper's measures of a variant, or those of an ending, by their names."""
-    keys = {m.name: f"metrics.{m.group}.{m.name}{ending}" for m in (*REGISTRATION, *COMPLETION)}
+    keys = {m.name: f"metrics.{m.group}.{m.name}{ending}" for m in MEASURES.values()}
     return {name: fields[key] for name, key in keys.items() if key in fields}
 
 

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from scenefuse.core.stage import quantity, read_json, write_json
+from scenefuse.nerf.appearance import DEPTH_JUMP
 from scenefuse.nerf.field import Field, FieldSettings, encode
 from scenefuse.nerf.losses import DEPTH_DELTA, SOLID_OPACITY, LossWeights
 from scenefuse.nerf.prior_training import LEARNING_RATE, Recipe
 from scenefuse.nerf.rays import PhotoTensors, dilate
-from scenefuse.nerf.rendered_maps import DEPTH_JUMP
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, prepare_device, train_stage
 from scenefuse.nerf.training import OCCUPANCY_EVERY, Nerf, NerfRecipe, Rendered, Schedule
 from scenefuse.photos.views import load_views
@@ -45,8 +45,6 @@ MIN_APART = 0.02
 RANK_MARGIN = 2 * DEPTH_DELTA
 # Rows of the fine levels that show nothing but edges take steps 1 + this times as long (method N9).
 EDGE_RATE = 1.0
-# Half-width of the zone around mask edges and depth jumps that counts as an edge: rays are drawn beyond the band.
-EDGE_PX = NERF.mask_band_px + 1
 
 
 class OrderAndEdges:
@@ -77,7 +75,8 @@ class OrderAndEdges:
         self.state = torch.zeros(len(nerf.field.table), 2, device=device)
         self.images, self.apart_px, self.rate = images, MIN_APART * photos.images.shape[2], edge_rate
         border = dilate(photos.masks, 1) & ~dilate(photos.masks, -1)
-        self.edges = dilate(border | depth_jumps(photos.depths), EDGE_PX).float().to(device)
+        # Rays are drawn beyond the band: the zone around mask edges and depth jumps that counts as an edge is wider.
+        self.edges = dilate(border | depth_jumps(photos.depths), NERF.mask_band_px + 1).float().to(device)
 
     def losses(self, rendered: Rendered, nerf: Nerf) -> dict[str, Tensor]:
         """The loss of order; edges are counted whenever the occupancy is updated."""

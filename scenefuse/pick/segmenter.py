@@ -94,10 +94,9 @@ class Segmenter:
                     return
                 except (StageError, UnavailableError, OSError) as error:
                     self.trouble = f"Masks are shown by GrabCut, not by SAM 2: {error}"
-            from scenefuse.masks.segmentation import PROPAGATION_WIDTHS, MaskSettings
+            from scenefuse.masks.segmentation import MaskSettings
 
-            width = PROPAGATION_WIDTHS * MaskSettings().grabcut_width_px
-            self._ask, self.method = partial(query_grabcut, width), "GrabCut"
+            self._ask, self.method = partial(query_grabcut, MaskSettings().grabcut_width_px), "GrabCut"
 
     def _fetch_once(self, place: Path) -> None:
         """Fetch the weights to their place, unless something has tried it already, or does so meanwhile.
