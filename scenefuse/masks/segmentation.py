@@ -16,7 +16,7 @@ from scenefuse.marks.clicks import Clicks, ScenePoints
 from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks, clicks_per_photo
 from scenefuse.marks.triangulation import marked_size, triangulate_consistent
 from scenefuse.masks.grabcut import along_edges, cleaned, first_cuts, query_grabcut, second_cuts
-from scenefuse.masks.prompts import Segmenter
+from scenefuse.masks.prompts import BOX_GROWTH_SHARE, Segmenter
 from scenefuse.masks.propagation import propagate
 from scenefuse.masks.sam2 import LOGITS_PX, SIDE_PX, Sam2, query_sam2, segment
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
@@ -53,7 +53,7 @@ class MaskSettings:
     min_agreement: float = 0.6
     """Smallest IoU of a mask with the hull's outline; below it the photo is left out."""
     max_click_residual_px: float = setting(4, unit="px", least=0)
-    """Largest reprojection error of a prompt clicked in several photos, if 3 % of what is clicked in one is not more;
+    """Largest reprojection error of a prompt clicked in several photos, if 5 % of what is clicked in one is not more;
     and how far a click inside or outside may lie on the wrong side of its mask's outline. Others are left out and
     named."""
     min_photos: int = 5
@@ -185,11 +185,6 @@ def carve_consistent(
     return hull
 
 
-# Clicks on a point that miss each other by this share of what is clicked still say where the object ends: corners that
-# a hand misses, or that are none (a hat's brim).
-MAX_MISS_SHARE = 0.03
-
-
 @dataclass(frozen=True)
 class Prompted:
     """What prompts lead to.
@@ -270,7 +265,8 @@ def _points(
         names, points, exact = marked.points, marked.positions, np.ones(len(marked.points), dtype=bool)
     else:
         model = read_model(sparse)
-        limit = max(max_residual_px, MAX_MISS_SHARE * marked_size(marked, model, sizes))
+        # A little farther off they still say where the object ends: corners that a hand misses, or a hat's brim.
+        limit = max(max_residual_px, BOX_GROWTH_SHARE * marked_size(marked, model, sizes))
         names, points, residuals, left_out = triangulate_consistent(marked, model, limit, sizes)
         exact = residuals <= max_residual_px
         off = [f"{name} {px:.1f} px" for name, px in zip(names, residuals) if px > max_residual_px]

@@ -25,8 +25,6 @@ DEPTH_JUMP = 0.03
 MIN_OPACITY = 0.9
 # Pixels nearer to black are mostly noise, and nearer to white mostly clipped.
 COLOR_MARGIN = 0.03
-# Logarithms of colours that differ by more than this are a highlight, a shadow or another surface.
-LOG_DELTA = 0.05
 # A photo that was not trained on is taken to have the gains of so many that were taken nearest to it.
 GAIN_NEIGHBOURS = 2
 # Sharpness compares details finer than a Gaussian's sigma of one pixel with those between it and this one.
@@ -140,7 +138,7 @@ def solved(shared: SharedColors, photos: int) -> Appearance:
     log_gain, falloff = torch.zeros(photos, 3, dtype=torch.float64), torch.zeros((), dtype=torch.float64)
     for _ in range(10):
         left = difference - (log_gain[a] - log_gain[b]) - (falloff * radial)[:, None]
-        weight = (LOG_DELTA / left.abs().amax(1).clamp(min=1e-9)).clamp(max=1.0)
+        weight = (COLOR_DELTA / left.abs().amax(1).clamp(min=1e-9)).clamp(max=1.0)
         log_gain = _gains(a, b, weight, difference - (falloff * radial)[:, None], 1e-3 * pairs.clamp(min=1))
         left = (difference - (log_gain[a] - log_gain[b])).mean(1)
         falloff = (weight * radial * left).sum() / ((weight * radial**2).sum() + 1e-5 * count)

@@ -28,8 +28,6 @@ Maps = NDArray[np.float32]
 
 # Fewer points than these are no surface.
 MIN_POINTS = 100
-# Voxels are no larger than so many pixels: windows of five pixels, which the depths were matched by, tell no more.
-VOXEL_PIXELS = 2
 # Points belong to one group where steps of this many spacings lead from one to the other.
 MAX_STEP = 3
 # Points that a normal's plane is fitted to.
@@ -115,7 +113,9 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
             f"no surface found: {len(raw)} points of {inputs.stage} pass the gates; check masks and held-out renders, "
             "or lower min_views"
         )
-    voxel = min(settings.spacing * diagonal, VOXEL_PIXELS * footprint(maps.depths, views.intrinsics))
+    # Voxels are no larger than half a window that depths were matched by, which tells no more.
+    pixels = settings.refinement.match_window_px // 2
+    voxel = min(settings.spacing * diagonal, pixels * footprint(maps.depths, views.intrinsics))
     thinned = voxel_downsample(raw, voxel)
     cleaned = with_plane_normals(clean(thinned, settings.gates.min_component, voxel))
     shares = float(refined.moved.sum() / rendered), float(refined.inconsistent.sum() / rendered)

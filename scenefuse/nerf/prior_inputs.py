@@ -32,7 +32,8 @@ MARGIN = 0.06
 STEREO = DepthMapSettings(sources=6, best_sources=2, window_px=5)
 # Matching score at which stereo and SfM points count the same.
 EVEN_SCORE = 0.3
-# SfM points that a pixel takes its disparity from, and that a point is held against to find outliers.
+# SfM points that a pixel takes its disparity from, that a point is held against to find outliers, and that fix a map's
+# scale and shift.
 NEAREST_POINTS = 8
 Map = NDArray[np.float32]
 

@@ -19,13 +19,18 @@ from scenefuse.core.stage import atomic_directory, quantity, setting, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.monodepth import DepthNetwork, depth_from_disparity, parameters, sample
-from scenefuse.nerf.prior_inputs import STEREO, DepthPhotos, NetworkInputs, crop_to_object, depth_photos, network_inputs
+from scenefuse.nerf.prior_inputs import (
+    NEAREST_POINTS,
+    STEREO,
+    DepthPhotos,
+    NetworkInputs,
+    crop_to_object,
+    depth_photos,
+    network_inputs,
+)
 from scenefuse.nerf.prior_training import Recipe, loss_quantities, predict, prepare_torch, train_network
 from scenefuse.nerf.refine_depth import MAP_AGREEMENT, confirm, write_prior
 from scenefuse.photos.views import load_views
-
-# Points that fix the scale and shift of a map.
-MIN_POINTS = 5
 
 Content = dict[str, Any]
 
@@ -158,7 +163,7 @@ def align_to_points(predicted: Array, measured: Array) -> tuple[float, float]:
         predicted: (N,) depths of the map at SfM points.
         measured: (N,) depths of those points.
     """
-    if len(predicted) < MIN_POINTS:
+    if len(predicted) < NEAREST_POINTS:
         return 1.0, 0.0
 
     line = siegelslopes(measured, predicted)

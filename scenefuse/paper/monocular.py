@@ -30,7 +30,7 @@ from scenefuse.nerf.prior_training import Objective, PhotoScale, Recipe, huber, 
 from scenefuse.photos.views import Views
 
 # What the depth network can say: an object that fits into its photos, about 1 away, is neither nearer nor farther.
-NEAR, FAR = 0.5, 2.0
+NEAR = 0.5
 # Photos are compared at these fractions of their size one after the other, in equal parts of the training.
 SHRINKS = (4, 2, 1)
 # Frames that differ less on the object, on the mean, show no motion: two grey levels.
@@ -179,7 +179,7 @@ def frames_of(views: Views, device: torch.device) -> DepthPhotos:
         nothing,
         nothing,
         NEAR,
-        FAR,
+        1 / NEAR,
         diagonal=1.0,
     )
     _check_motion(frames)
@@ -217,7 +217,7 @@ def new_monocular_networks(device: torch.device) -> Networks:
 
 def supervision_of(frames: DepthPhotos, target: Tensor | None = None, weight: Tensor | None = None) -> Supervision:
     """Colours, with a first depth of 1 everywhere; (V, 1, H, W) target depths and weights."""
-    one = disparity_from_depth(torch.ones_like(frames.masks), NEAR, FAR)
+    one = disparity_from_depth(torch.ones_like(frames.masks), NEAR, 1 / NEAR)
     return Supervision(frames.images * 2.0 - 1.0, one, target, weight)
 
 
@@ -234,7 +234,7 @@ def monocular_losses(networks: Networks, frames: DepthPhotos, supervision: Super
     def losses(chosen: Tensor, step: int, generator: torch.Generator) -> dict[str, Tensor]:
         scale = scales[step * len(scales) // steps]
         disparity = networks.depth(supervision.colors[chosen], supervision.first[chosen])
-        depth = depth_from_disparity(disparity, NEAR, FAR)
+        depth = depth_from_disparity(disparity, NEAR, 1 / NEAR)
         sources = frames.sources[chosen]
         moves = torch.stack([networks.pose(small[chosen], small[of]) for of in sources.T], 1)
         unmoved = scale.unmoved[chosen] if scale is scales[-1] else None

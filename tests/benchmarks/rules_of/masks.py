@@ -159,5 +159,5 @@ RULES = [
     Rule("seeds grow along even colours", f"{M}.grabcut.grow_seeds", lambda _: lambda *__: None),
     Rule("close prompts enclose a part", f"{M}.target._parts", lambda _: lambda *__: np.empty((0, 4), np.intp)),
     Rule("clicked specks stay", f"{M}.grabcut.prompted_parts", lambda _: lambda mask, *__: mask & False),
-    Rule("clicks on a point may miss by 3 %", f"{M}.segmentation.MAX_MISS_SHARE", lambda _: 0.0),
+    Rule("clicks on a point may miss by 5 %", f"{M}.segmentation.BOX_GROWTH_SHARE", lambda _: 0.0),
 ]
