@@ -22,6 +22,8 @@ from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.nerf.rays import SURFACE_DEPTH, dilate
 from scenefuse.photos.workspace import View
 
+# Share of the cube's side left free on each side of the hull, for what the masks cut off.
+MARGIN = 0.02
 # Share of the photos that must frame a cell, more than masks need: what few photos bound is large, and costs rays.
 MIN_FRAMING_SHARE = 0.3
 # The first, rough cube is wider by this share on each side than the masks' extents ask for, or the object's own points.
@@ -54,8 +56,7 @@ def find_volume(
     try:
         if cube is None:
             rough = _rough_cube([outline.view for outline in outlines], own)
-            # One of the coarse cells is left free on each side of the hull, for what the masks cut off.
-            cube = tight_cube(visual_hull(outlines, rough, cells // 2, tolerance, own), rough, 2 / cells)
+            cube = tight_cube(visual_hull(outlines, rough, cells // 2, tolerance, own), rough, MARGIN)
         hull = visual_hull(outlines, cube, cells, tolerance, own)
     except ValueError as error:
         raise StageError(f"no volume for the object: {error}; check the masks and the cameras") from None
