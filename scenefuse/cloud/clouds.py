@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.formats import columns_in_parts
 from scenefuse.cloud.readers.columns import (
     COLOR,
+    MAX_ODD_SHARE,
     NORMAL,
     POSITION,
     UNIT_TOLERANCE,
@@ -27,8 +28,6 @@ from scenefuse.cloud.readers.ply import Element, header_of
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.transforms import Sim3
 
-# Share of points that lie where others do, from which it is said.
-MIN_COINCIDING = 0.1
 # Share of the spacing of points, from which the steps of their coordinates show.
 MAX_STEP = 0.25
 
@@ -144,7 +143,7 @@ def spacing(points: NDArray[np.float64], seed: int = 0, quantile: float = 0.5) -
     """Median (or other quantile) distance from a point to its nearest neighbour elsewhere, by a seeded sample; 0 where
     all are in one place. Of points that coincide, as in a scan that was merged twice, one counts."""
     distance = _to_nearest(points, seed)
-    if np.count_nonzero(distance == 0) > MIN_COINCIDING * len(distance):
+    if np.count_nonzero(distance == 0) > MAX_ODD_SHARE * len(distance):
         distance = _to_nearest(np.unique(points, axis=0), seed)
     distance = distance[distance > 0]
     return float(np.quantile(distance, quantile)) if len(distance) else 0.0
@@ -234,7 +233,7 @@ def coincidence_note(path: Path, points: NDArray[np.float64]) -> list[str]:
     """What to say of a file where many of (N, 3) points lie in the place of others."""
     distance = _to_nearest(points)
     same = np.count_nonzero(distance == 0) / max(len(distance), 1)
-    if same <= MIN_COINCIDING:
+    if same <= MAX_ODD_SHARE:
         return []
     return [
         f"{same:.0%} of the points of {path.name} lie exactly where others do, as in a scan that was merged twice or"

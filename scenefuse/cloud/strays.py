@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, voxel_downsample, voxels
-from scenefuse.cloud.readers.columns import AT_ONCE
+from scenefuse.cloud.readers.columns import AT_ONCE, MAX_ODD_SHARE
 from scenefuse.core.stage import threads
 
 # Points below this percentile along an axis, and above the same on the other side, do not say how far a cloud reaches.
@@ -15,11 +15,9 @@ NEIGHBOURS = 8
 # A stray's neighbours are farther than this share of the cloud's diagonal, and than so many times the usual distance;
 # so many sizes of a cloud away from it, nothing is a part of it.
 MIN_STRAY_SHARE, MIN_STRAY_TIMES = 0.02, 10.0
-# Larger shares of all points are no strays.
-MAX_STRAYS = 0.1
-# In sizes of the box: cubes in which a point counts once; cubes in which more points than a stray has neighbours are a
-# part of the cloud, and by which a box has to grow.
-EVEN_CUBE, COARSE_CUBE = 0.02, 0.25
+# In sizes of the box: cubes in which more points than a stray has neighbours are a part of the cloud, and by which a
+# box has to grow.
+COARSE_CUBE = 0.25
 
 
 def is_nothing_at_zero(others: NDArray[np.float64], zeros: int) -> bool:
@@ -47,10 +45,10 @@ def strays(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     if len(near) > NEIGHBOURS and size:
         tree, parts = cKDTree(points[near]), np.array_split(points[near], 1 + len(near) // AT_ONCE)
         away = np.concatenate([tree.query(part, k=NEIGHBOURS + 1, workers=threads())[0][:, -1] for part in parts])
-        evenly = voxel_downsample(Cloud(points[near], fields={"away": away})[together], EVEN_CUBE * size)
+        evenly = voxel_downsample(Cloud(points[near], fields={"away": away})[together], MIN_STRAY_SHARE * size)
         usual = float(np.median(evenly.fields["away"])) if len(evenly) else np.inf
         far[near] = away > max(MIN_STRAY_SHARE * float(np.linalg.norm(high - low)), MIN_STRAY_TIMES * usual)
-    return far if far.mean() <= MAX_STRAYS else np.zeros(len(points), dtype=bool)
+    return far if far.mean() <= MAX_ODD_SHARE else np.zeros(len(points), dtype=bool)
 
 
 def _box_of_most(

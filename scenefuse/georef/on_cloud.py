@@ -38,12 +38,12 @@ MIN_SEEN, MIN_MET = 0.1, 0.2
 USUAL_MET, MIN_BETTER_MET, MAX_OFF = 0.6, 0.15, (0.01, 1.0, 1.0)
 # What is met by the cloud: within this share of the distance to the nearest camera, or within a spacing of the cloud.
 MAX_MET_SHARE = 0.002
-# Fewer points of a model in the cloud's box say that the cloud is elsewhere; fewer over it do not lay the model on it.
-MIN_INSIDE, MIN_OVER = 10, 50
+# Fewer points of a model in the cloud's box, or over it, neither show whether the two fit nor lay the model on it.
+MIN_OVER = 50
 # What GPS is off at most, in metres: the cloud is looked at so far beyond the model.
 MAX_GPS_ERROR_M = 30.0
-# ICP goes on in so many rounds of steps, until one moves no point by more than this share of the model's extent.
-ROUNDS, MAX_STEP = 10, 1e-3
+# ICP goes on until a round of steps moves no point by more than this share of the model's extent.
+MAX_STEP = 1e-3
 # What is reported of a fit in any case.
 FIT = ("seen_share", "met_share")
 
@@ -78,7 +78,7 @@ def fit_to_cameras(points: Array, model: pycolmap.Reconstruction) -> dict[str, A
     own = _in_box_of(points, own)
     met = _met(points, own, centres)
     content = {"seen_share": quantity(seen, "1"), "met_share": quantity(met, "1")}
-    if seen < MIN_SEEN or len(own) < MIN_INSIDE or met > USUAL_MET:
+    if seen < MIN_SEEN or len(own) < MIN_OVER or met > USUAL_MET:
         return content
     moved = refine_on_cloud(own, points)
     middle = own.mean(0)
@@ -225,7 +225,7 @@ def _onto(cloud: Array, own: Array, name: str) -> Sim3:
         )
     moved = Sim3(1.0, np.eye(3), np.array([0.0, 0.0, _height_above(cloud, own[over])]))
     stays = MAX_STEP * float(np.linalg.norm(np.ptp(own, axis=0)))
-    for _ in range(ROUNDS):
+    for _ in range(10):
         here = moved.apply(own)
         here = here[_over(cloud, here)]
         if len(here) < MIN_OVER:
@@ -265,7 +265,7 @@ def _in_box_of(points: Array, own: Array) -> Array:
 
 def _met(points: Array, own: Array, centres: Array) -> float:
     """Share of a model's points (M, 3) that lie on a cloud (N, 3); centres (V, 3): of cameras."""
-    if len(own) < MIN_INSIDE:
+    if len(own) < MIN_OVER:
         return 0.0
     reach = np.maximum(MAX_MET_SHARE * cKDTree(centres).query(own)[0], spacing(points))
     return float((cKDTree(points).query(own, workers=threads())[0] <= reach).mean())

@@ -27,8 +27,6 @@ MAX_BENT = 0.1
 MAX_GPS_OFF_M = 1000.0
 # In standard deviations: error of a control point or a position at which it loses half its weight (Cauchy).
 ROBUST_SD = 3.0
-# Each round halves what filling in half of the heights leaves to be found.
-FILL_ROUNDS = 30
 
 
 @dataclass(frozen=True)
@@ -180,7 +178,7 @@ def beside_gps(
     start = [np.array([s.x_in_model for s, u in zip(located, points) if u]), gps.centres[inliers]]
     wanted = [there[points], target[inliers]]
     stated = np.array([s.point.sd_m[0] for s, u in zip(located, points) if u])
-    for _ in range(FILL_ROUNDS):
+    for _ in range(30):  # each halves what filling in half of the heights leaves to be found
         here = [fitted.apply(part) for part in start]
         here[1] += shift
         off = np.abs(wanted[0] - here[0])
@@ -300,7 +298,7 @@ def fit_measured(centres: Array, target: Array, limit: float, seed: int) -> tupl
     fitted, inliers = fit_sim3_robust(centres[whole], target[whole], limit, seed=seed)
     if whole.all():
         return fitted, inliers
-    for _ in range(FILL_ROUNDS):
+    for _ in range(30):  # as in `beside_gps`
         here = fitted.apply(centres)
         filled = np.where(known, target, here)
         inliers = np.linalg.norm(filled - here, axis=1) <= limit

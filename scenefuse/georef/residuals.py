@@ -11,16 +11,12 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import atomic_file, quantity
 from scenefuse.core.transforms import Array
 from scenefuse.georef.control import Control, LocatedPoint, seen_at
-from scenefuse.georef.placement import GpsCameras, Placement
+from scenefuse.georef.placement import OUTLIER_SD, GpsCameras, Placement
 from scenefuse.marks.lengths import Lengths
 from scenefuse.photos.geodesy import LocalFrame
 
 COLUMNS = ["kind", "name", "used", "error_m", "east_m", "north_m", "up_m", "horizontal_sd_m", "vertical_sd_m"]
 COLUMNS += ["photos", "reprojection_px"]
-
-
-# Control points that miss their coordinates by so many standard deviations deserve a note.
-MISFIT_SD = 5.0
 
 
 @dataclass(frozen=True)
@@ -189,7 +185,7 @@ def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str
     sd_m = np.array([s.point.sd_m for s in control.located]).reshape(-1, 2)
     horizontal = np.linalg.norm(left.points[:, :2], axis=1) / sd_m[:, 0]
     ratio = np.where(used, np.fmax(horizontal, np.abs(left.points[:, 2]) / sd_m[:, 1]), 0.0)
-    worst = [k for k in np.argsort(-ratio) if ratio[k] > MISFIT_SD]
+    worst = [k for k in np.argsort(-ratio) if ratio[k] > OUTLIER_SD]
     if not worst:
         return []
     named = [
@@ -197,7 +193,7 @@ def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str
         for k in worst[:3]
     ]
     return [
-        f"{len(worst)} of {used.sum()} control points are more than {MISFIT_SD:g} stated standard deviations off, in"
+        f"{len(worst)} of {used.sum()} control points are more than {OUTLIER_SD:g} stated standard deviations off, in"
         f" metres: {', '.join(named)}; correct coordinates and clicks, or state larger deviations in columns 8 and 9"
     ]
 

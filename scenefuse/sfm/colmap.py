@@ -12,9 +12,8 @@ import pycolmap
 
 from scenefuse.core.stage import StageError, threads
 
-# He et al. 2026: iterations of a global bundle adjustment, of the linear solver within one, and its tolerance; 0 runs
-# all iterations.
-ITERATIONS, LINEAR_SOLVER_ITERATIONS, TOLERANCE = 100, 200, 0.0
+# He et al. 2026: iterations of a global bundle adjustment, and of the linear solver within one.
+ITERATIONS, LINEAR_SOLVER_ITERATIONS = 100, 200
 # Relative gain that ends an adjustment which only compares or repeats.
 ROUGH_TOLERANCE = 1e-7
 # Observations with a larger error are dropped, as COLMAP's mapper does.
@@ -38,13 +37,13 @@ class Freedom:
     principal_point: bool = False
 
 
-def adjust(model: pycolmap.Reconstruction, freedom: Freedom, tolerance: float = TOLERANCE) -> None:
+def adjust(model: pycolmap.Reconstruction, freedom: Freedom, tolerance: float = 0.0) -> None:
     """Adjust poses, points and the free part of the lenses of a model in place, by Cauchy-weighted errors."""
     cancellable(pycolmap.bundle_adjustment, model, adjustment_options(freedom, tolerance))
 
 
-def adjustment_options(freedom: Freedom, tolerance: float) -> pycolmap.BundleAdjustmentOptions:
-    """COLMAP's options of an adjustment."""
+def adjustment_options(freedom: Freedom, tolerance: float = 0.0) -> pycolmap.BundleAdjustmentOptions:
+    """COLMAP's options of an adjustment; a relative gain of 0 ends none before its iterations do (He et al. 2026)."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = options.refine_extra_params = freedom.lens
@@ -55,8 +54,7 @@ def adjustment_options(freedom: Freedom, tolerance: float) -> pycolmap.BundleAdj
     solver.max_num_iterations = ITERATIONS
     solver.max_linear_solver_iterations = LINEAR_SOLVER_ITERATIONS
     solver.function_tolerance = tolerance
-    solver.gradient_tolerance = TOLERANCE
-    solver.parameter_tolerance = TOLERANCE
+    solver.gradient_tolerance = solver.parameter_tolerance = 0.0
     solver.num_threads = threads()
     return options
 

@@ -15,9 +15,9 @@ from scipy import ndimage
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, write_json
 from scenefuse.core.transforms import Array
+from scenefuse.photos.cameras.json_cameras import PERSPECTIVE
 from scenefuse.photos.cameras.posed_photo import PosedPhoto, at_size
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
-from scenefuse.photos.cameras.transforms import PERSPECTIVE
 from scenefuse.photos.photo_files import frame_name, masks_by_name, pictures_below, stored_size
 from scenefuse.photos.photos import (
     SHAPE_TOLERANCE,
@@ -34,9 +34,6 @@ from scenefuse.sfm.undistort import UndistortSettings, undistort_picture
 
 Picture = NDArray[np.uint8]
 Lens = tuple[pycolmap.Camera, View]
-
-# Transparent pixels up to this far from others take their colour: farther than resampling reaches.
-BLEED_PX = 16
 
 
 def import_photos(
@@ -240,8 +237,8 @@ def _mask(file: Path | None, picture: Picture) -> Picture | None:
 
 
 def _bled(picture: Picture, alpha: Picture) -> Picture:
-    """Transparent pixels near others take the nearest one's colour, so that resampling mixes no background in."""
+    """Transparent pixels take the colour of the nearest other one, so that resampling mixes no background in."""
     if not alpha.any():
         return picture
-    far, (rows, columns) = ndimage.distance_transform_edt(alpha == 0, return_indices=True)
-    return np.where(far[..., None] <= BLEED_PX, picture[rows, columns], 0).astype(np.uint8)
+    rows, columns = ndimage.distance_transform_edt(alpha == 0, return_distances=False, return_indices=True)
+    return np.asarray(picture[rows, columns])

@@ -13,15 +13,13 @@ import pycolmap
 
 from scenefuse.core.stage import quantity
 from scenefuse.core.transforms import Array
-from scenefuse.sfm.colmap import ROBUST_PX, ROUGH_TOLERANCE, Freedom, adjust
+from scenefuse.sfm.colmap import MIN_PHOTOS, ROBUST_PX, ROUGH_TOLERANCE, Freedom, adjust
 
 # A richer lens has to predict held-out observations better by so many standard errors.
 MIN_GAIN = 3.0
 # And their median error has to fall by this share. What changes less is no better lens that matters, but tangential
 # distortion in the place of a principal point, which turns the cameras.
 MIN_MEDIAN_GAIN = 0.005
-# One observation of every point seen so often is held out.
-MIN_TRACK = 4
 # Errors beyond it count as this, so that one wrong match does not decide.
 MAX_ERROR_PX = 20.0
 # A principal point farther from the middle, as a share of the longer side, is no lens but a fit to something else.
@@ -51,7 +49,7 @@ class Lens:
     freedom: Freedom
     words: str
 
-    def fit(self, model: pycolmap.Reconstruction, tolerance: float) -> pycolmap.Reconstruction:
+    def fit(self, model: pycolmap.Reconstruction, tolerance: float = 0.0) -> pycolmap.Reconstruction:
         """A copy of a model, adjusted with this lens."""
         fitted = copy.deepcopy(model)
         for camera in fitted.cameras.values():
@@ -129,7 +127,7 @@ def hold_out(model: pycolmap.Reconstruction) -> tuple[pycolmap.Reconstruction, H
     rng, kept, held = np.random.default_rng(0), copy.deepcopy(model), Held()
     for point in sorted(model.point3D_ids()):
         track = model.points3D[point].track.elements
-        if len(track) >= MIN_TRACK:
+        if len(track) > MIN_PHOTOS:
             chosen = track[int(rng.integers(len(track)))]
             pixel = model.images[chosen.image_id].points2D[chosen.point2D_idx].xy
             held.append((point, chosen.image_id, np.array(pixel)))

@@ -30,7 +30,6 @@ from scenefuse.sfm.colmap import (
     ITERATIONS,
     MIN_PHOTOS,
     ROUGH_TOLERANCE,
-    TOLERANCE,
     adjust,
     cancellable,
     drop_outliers,
@@ -177,11 +176,11 @@ def _attempt(
     adjust(ranked[0], (KNOWN if calibrated else HELD).freedom, ROUGH_TOLERANCE)
     drop_outliers(ranked[0])
     choice = choose_lens(ranked[0], (KNOWN,) if calibrated else DISTORTED)
-    model = choice.lens.fit(ranked[0], TOLERANCE)
+    model = choice.lens.fit(ranked[0])
     mappings = 1
     if choice.lens not in (HELD, KNOWN):
         again = _mapped_again(model, database, folder, sparse, _mapper_options(len(names), True, seed, least_matches))
-        second = choice.lens.fit(again[0], TOLERANCE) if again else None
+        second = choice.lens.fit(again[0]) if again else None
         if second is not None and _explained(second, database) >= MIN_EXPLAINED_AGAIN * _explained(model, database):
             ranked, model, mappings = again, second, 2
     drop_outliers(model)

@@ -347,7 +347,7 @@ def test_a_table_in_degrees_is_refused(tmp_path):
 
 def test_text_is_read_in_parts_and_a_bad_row_is_counted_from_its_part(tmp_path, monkeypatch):
     monkeypatch.setattr("scenefuse.cloud.readers.text.MAX_HEAD_LINES", 10)
-    monkeypatch.setattr("scenefuse.cloud.readers.text.MAX_LAYOUT_ROWS", 5)
+    monkeypatch.setattr("scenefuse.cloud.readers.text.TOGETHER", 5)
     points = np.random.default_rng(0).uniform(-5, 5, (25, 3)).round(3)
     np.savetxt(tmp_path / "a.xyz", points, fmt="%.3f", header="x y z\n")
     parts = list(read_text(tmp_path / "a.xyz", 10))

@@ -76,7 +76,7 @@ def test_the_constants_are_the_papers():
 def test_the_constants_of_sfm_are_the_papers():
     own = read_settings(ROOT / "config/paper.yaml")["scene"]
     assert (own["matches"]["max_ratio"], matches.MAX_DISTANCE, own["matches"]["guided_matching"]) == (0.7, 0.7, True)
-    options = colmap.adjustment_options(KNOWN.freedom, colmap.TOLERANCE).ceres.solver_options
+    options = colmap.adjustment_options(KNOWN.freedom).ceres.solver_options
     assert (options.max_num_iterations, options.max_linear_solver_iterations) == (100, 200)
     assert options.function_tolerance == options.gradient_tolerance == options.parameter_tolerance == 0
 

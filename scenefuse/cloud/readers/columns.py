@@ -1,11 +1,20 @@
-"""The columns of a cloud's file in parts: their names, whatever the file calls them, and the range of colours."""
+"""Columns of a cloud's file: names, whatever the file calls them; the range of colours; rows of numbers in text.
 
+Well-formed rows go through pandas' C parser. Others are split one by one: cells may be quoted, empty, or spell a
+missing number in any way. A row without numbers becomes a row of NaN, which the caller leaves out and counts.
+"""
+
+import csv
+import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from scenefuse.core.stage import StageError
 
 Columns = dict[str, NDArray[Any]]
 
@@ -13,8 +22,8 @@ Columns = dict[str, NDArray[Any]]
 AT_ONCE = 1 << 20
 # Normals may be this far from unit length; other ones say nothing of the surface.
 UNIT_TOLERANCE = 0.05
-# Share of colours above a range that interpolation overshoots.
-MAX_OVERSHOOT_SHARE = 0.1
+# A larger share of points or colours is no exception: colours that overshoot their range, strays, points in one place.
+MAX_ODD_SHARE = 0.1
 POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 # What other programs call colours, in lower case, in the languages of their users.
 COLOR_NAMES = (
@@ -32,6 +41,12 @@ OTHER_NAMES = {name: name for name in (*POSITION, *NORMAL)} | {
 }
 # What may stand before or behind the name of a column: whose colour it is, a unit, a range.
 AROUND = re.compile(r"^(diffuse|colou?r|rgb|scalar|vertex|farbe|couleur)(?=.)|[\[(].*$")
+# Around the number in a cell: quotes, blanks, and a byte order mark, whole or read as three letters.
+STRIPPED = " \t\"'\ufeff\u00ef\u00bb\u00bf"
+# A comment behind numbers; spreadsheets write #N/A.
+COMMENT = re.compile(r"(?:^|\s)\s*#(?!N/A)")
+# Rows that are parsed together, and that say what the columns are: one strange row makes all be split one by one.
+TOGETHER = 1 << 14
 
 
 def common_names(names: Sequence[str]) -> list[str]:
@@ -75,7 +90,7 @@ def white_of(kind: np.dtype[Any], counts: NDArray[np.int64]) -> float:
         kind: type of the colours.
         counts: (3,) of the whole file, by `color_counts`. Few numbers above a range overshoot it, and are clipped.
     """
-    few = MAX_OVERSHOOT_SHARE * counts[0]
+    few = MAX_ODD_SHARE * counts[0]
     if kind == np.uint8:
         return 255.0
     if counts[1] <= few and kind.kind == "f":
@@ -89,3 +104,145 @@ def bytes_of(colors: NDArray[Any], white: float | None = None) -> NDArray[np.uin
         return colors
     white = white or white_of(colors.dtype, color_counts(colors))
     return np.clip(np.rint(np.nan_to_num(colors.astype(np.float64)) * (255 / white)), 0, 255).astype(np.uint8)
+
+
+def separator(line: str) -> str | None:
+    """What separates the cells of a row; None for blanks. A tab does where no blanks separate words as well."""
+    mark = next((mark for mark in ";,|" if mark in line), None)
+    tabs = mark is None and "\t" in line.strip() and not any(len(cell.split()) > 1 for cell in line.split("\t"))
+    return "\t" if tabs else mark
+
+
+def cells_of(line: str, mark: str | None) -> list[str]:
+    """The cells of a row, without quotes and the blanks around them."""
+    line = line.strip(" \r\n\0" if mark == "\t" else None)
+    if '"' in line and line.count('"') % 2 == 0:
+        plain = line if mark else line.replace("\t", " ")
+        cells = next(csv.reader([plain], delimiter=mark or " ", skipinitialspace=True), [])
+    else:
+        cells = line.split(mark)
+    return [cell.strip(STRIPPED) for cell in cells]
+
+
+def number(cell: str) -> float | None:
+    """The number in a cell, NaN if it is empty or says that there is none; None for a word."""
+    for spelled in (cell, cell.lower().replace("d", "e")):  # 1.5D+02 is Fortran's way
+        try:
+            return float(spelled)
+        except ValueError:
+            pass
+    plain = cell.lower().strip("+-<>()[]#*.")
+    missing = plain in ("", "null", "na", "n/a", "none", "nil", "missing") or plain.startswith(("nan", "1.#"))
+    return np.nan if missing else None
+
+
+def number_rows(
+    lines: Sequence[bytes], mark: str | None, width: int, wanted: Sequence[int], needed: int, where: tuple[str, int],
+    comments: bool = True,
+) -> NDArray[np.float64]:  # fmt: skip
+    """The numbers (N, C) in some columns of rows; blank lines and comments are skipped.
+
+    Args:
+        lines: of the file.
+        mark: separates the cells; None for blanks.
+        width: cells of a row.
+        wanted: (C,) columns; other cells may hold anything.
+        needed: cells of a row at least, where a separator says which are missing.
+        where: the file, and the number of its first line here, for an error.
+        comments: whether # begins a comment, at the begin of a row or behind a blank.
+
+    Raises:
+        StageError: a row has numbers, but another count of cells; the file ends within a row.
+    """
+    found = [np.empty((0, len(wanted)))]
+    for first in range(0, len(lines), TOGETHER):
+        some = lines[first : first + TOGETHER]
+        rows = _together(some, mark, width, wanted, comments)
+        if rows is None:
+            place = where[0], where[1] + first
+            rows = _one_by_one(some, mark, width, wanted, needed, place, comments)
+        found.append(rows)
+    return np.concatenate(found)
+
+
+def next_rows(lines: Iterator[bytes], most: int, width: int, where: tuple[str, int]) -> tuple[NDArray[np.float64], int]:
+    """The next rows (N, C) of a file, so many at most and all their numbers, and the number of the line behind them."""
+    found, line = [np.empty((0, width))], where[1]
+    while (missing := most - sum(map(len, found))) and (some := list(islice(lines, missing))):
+        found.append(number_rows(some, None, width, range(width), width, (where[0], line)))
+        line += len(some)
+    return np.concatenate(found), line
+
+
+def typed(values: NDArray[np.float64], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Numbers of text as integers of a type, a missing one as 0, a large one as the largest; real ones stay."""
+    if kind.kind == "f":
+        return values
+    ends = np.iinfo(kind)
+    return np.clip(np.rint(np.nan_to_num(values)), ends.min, ends.max).astype(kind)
+
+
+def _together(
+    lines: Sequence[bytes], mark: str | None, width: int, wanted: Sequence[int], comments: bool
+) -> NDArray[np.float64] | None:
+    """The same of well-formed rows; None where there are others."""
+    import pandas as pd
+
+    blob = b"".join(lines).replace(b'"', b"")
+    if (comments and b"#" in blob) or (_cell_counts(blob, mark) != width).any():
+        lines = [line for line in lines if line.strip() and not (comments and COMMENT.match(line.decode("latin-1")))]
+        blob = b"".join(lines).replace(b'"', b"")
+        if not lines or b"#" in blob or (_cell_counts(blob, mark) != width).any():
+            return None if lines else np.empty((0, len(wanted)))
+    try:
+        table = pd.read_csv(
+            io.BytesIO(blob), sep=mark or r"\s+", header=None, names=range(width), usecols=sorted(set(wanted)),
+            index_col=False, dtype=np.float64, quoting=csv.QUOTE_NONE,
+            encoding="latin-1", skip_blank_lines=False,
+        )  # fmt: skip
+    except (ValueError, OverflowError):
+        return None
+    return table[list(wanted)].to_numpy() if len(table) == len(lines) else None
+
+
+def _cell_counts(blob: bytes, mark: str | None) -> NDArray[np.int64]:
+    """(N,) cells of each line."""
+    text = np.frombuffer(blob, np.uint8)
+    if mark is None:
+        blank = text <= ord(" ")
+        begins = np.flatnonzero(~blank & np.concatenate([[True], blank[:-1]]))
+    else:
+        begins = np.flatnonzero(text == ord(mark))
+    ends = np.flatnonzero(text == ord("\n"))
+    if not blob.endswith(b"\n"):
+        ends = np.append(ends, len(text))
+    return np.diff(np.searchsorted(begins, ends), prepend=0) + (mark is not None)
+
+
+def _one_by_one(
+    lines: Sequence[bytes], mark: str | None, width: int, wanted: Sequence[int], needed: int, where: tuple[str, int],
+    comments: bool,
+) -> NDArray[np.float64]:  # fmt: skip
+    """The same, cell by cell."""
+    found: list[list[float]] = []
+    for at, line in enumerate(lines, where[1]):
+        text = line.decode("latin-1")
+        text = COMMENT.split(text)[0] if comments else text
+        if not text.strip():
+            continue
+        cells = cells_of(text, mark)
+        numbers = [number(cell) for cell in cells]
+        if len(cells) != width and not any(cells[width:]) and mark and len(cells) >= needed:
+            numbers += [np.nan] * (width - len(cells))  # spreadsheets leave empty cells at the end out, or add some
+        elif len(cells) != width:
+            known = sum(value is not None and not np.isnan(value) for value in numbers)
+            if len(cells) < width and not line.endswith(b"\n"):
+                raise StageError(f"{where[0]} is cut short: it ends within a row, line {at}; copy it again")
+            if known >= 3 or (known and None not in numbers):
+                raise StageError(
+                    f"{where[0]}, line {at}, has {len(cells)} columns, the first row {width}: '{text.strip()[:60]}';"
+                    " correct that line, or export the cloud again"
+                )
+            numbers = [np.nan] * width
+        found.append([np.nan if (value := numbers[column]) is None else value for column in wanted])
+    return np.array(found).reshape(-1, len(wanted))

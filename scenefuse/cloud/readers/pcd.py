@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import COLOR, Columns
-from scenefuse.cloud.readers.rows import next_rows, typed
+from scenefuse.cloud.readers.columns import COLOR, Columns, next_rows, typed
 from scenefuse.core.stage import StageError
 
 

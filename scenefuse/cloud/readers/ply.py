@@ -8,9 +8,17 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from scenefuse.cloud.readers.columns import POSITION, Columns, bytes_of, colors_of, common_names, positions
+from scenefuse.cloud.readers.columns import (
+    POSITION,
+    Columns,
+    bytes_of,
+    colors_of,
+    common_names,
+    next_rows,
+    positions,
+    typed,
+)
 from scenefuse.cloud.readers.meshes import Mesh, sampled_columns, triangles
-from scenefuse.cloud.readers.rows import next_rows, typed
 from scenefuse.core.stage import StageError
 
 KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")

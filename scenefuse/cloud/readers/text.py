@@ -10,8 +10,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, NORMAL, POSITION, UNIT_TOLERANCE, Columns, common_names
-from scenefuse.cloud.readers.rows import COMMENT, cells_of, number, number_rows, separator
+from scenefuse.cloud.readers.columns import (
+    AT_ONCE,
+    COLOR,
+    COMMENT,
+    NORMAL,
+    POSITION,
+    TOGETHER,
+    UNIT_TOLERANCE,
+    Columns,
+    cells_of,
+    common_names,
+    number,
+    number_rows,
+    separator,
+)
 from scenefuse.core.stage import StageError
 
 TEXTS = (".xyz", ".pts", ".txt", ".asc", ".csv")
@@ -25,8 +38,8 @@ MIN_CORRELATION_GAIN = 0.1
 MIN_RANGE_RATIO = 0.25
 # Rows or columns that no scanner's grid has more of; most coordinates in metres do.
 MAX_GRID_ROWS = 100_000
-# Lines in which the first row is looked for, and rows by which it is told what their columns are.
-MAX_HEAD_LINES, MAX_LAYOUT_ROWS = 50, 100_000
+# Lines in which the first row is looked for.
+MAX_HEAD_LINES = 50
 
 
 @dataclass(frozen=True)
@@ -75,7 +88,7 @@ def text_layout(path: Path) -> TextLayout:
         return TextLayout()
     above, mark, width, named = _first_row(path, head)
     begin = TextLayout(above, mark, width, named)
-    rows = begin.rows(path, list(islice(_lines(path), above, MAX_LAYOUT_ROWS)), above + 1, range(width))
+    rows = begin.rows(path, list(islice(_lines(path), above, TOGETHER)), above + 1, range(width))
     rows = rows[np.isfinite(rows).any(1)]
     known = np.asarray(np.isfinite(rows).any(0))
     names = _names(head[:above], mark, width)

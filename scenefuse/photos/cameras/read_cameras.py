@@ -17,11 +17,10 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines
 from scenefuse.core.transforms import Array
 from scenefuse.photos.cameras.colmap import read_colmap
+from scenefuse.photos.cameras.json_cameras import TRANSFORMS, find_opensfm, opensfm_place, read_opensfm, read_transforms
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
-from scenefuse.photos.cameras.opensfm import find_opensfm, opensfm_place, read_opensfm
 from scenefuse.photos.cameras.place import Place
 from scenefuse.photos.cameras.posed_photo import FLIP, GivenCamera, PosedPhoto, colmap_camera
-from scenefuse.photos.cameras.transforms import TRANSFORMS, read_transforms
 from scenefuse.photos.photo_files import BUNDLER, bundler_list, colmap_models, files_by_name, stored_size
 
 Found = TypeVar("Found")
