@@ -1,6 +1,7 @@
 """The command `scenefuse`: its parts import what they run only when they are called."""
 
 import argparse
+import inspect
 import os
 import sys
 from collections.abc import Callable
@@ -11,26 +12,6 @@ from scenefuse.core.version import VERSION
 
 ALL = "pip install 'scenefuse[all]'"
 OWN_SETTINGS, SCENES = Path("config/config.yaml"), Path("config/scenes.tsv")
-RUN_HELP = """\
-usage: scenefuse run [FILE ...] [OPTION ...]    in the folder of a project
-
-Makes what is missing or no longer up to date: all, or the given files, as results/objects/NAME/fused.ply.
-
-  -n, --dry-run            say what would run, and why
-  --cores N                processor cores; all, where it is left out
-  --configfile FILE ...    settings in place of config/config.yaml
-  --directory FOLDER       the project, where it is not this folder
-  --forcerun RULE ...      make the outputs of a rule again
-  --until RULE ...         stop after a rule
-  --resources mem_mb=N     use no more memory than this
-  --profile FOLDER         on a cluster
-  --printshellcmds         print the command of each job
-  --report FILE.html       no run; a report of what made the results
-  --unlock                 go on after a run that was killed
-  --version                of Snakemake
-
-All options are Snakemake's: python -m snakemake --help
-"""
 # Snakemake's options that say how much runs at a time, or that another machine decides it.
 PARALLEL = ("--cores", "-c", "--jobs", "-j", "--profile", "--workflow-profile", "--executor", "-e")
 
@@ -40,7 +21,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog="scenefuse",
         description="Complete single objects in a drone reconstruction by close-up photos, or a cloud by another.",
-        epilog="\n".join(f"{name:10}{part.__doc__}" for name, part in PARTS.items()),
+        epilog="\n".join(f"{name:10}{(part.__doc__ or '').splitlines()[0]}" for name, part in PARTS.items()),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"scenefuse {VERSION}")
@@ -77,8 +58,8 @@ def _pick() -> None:
     from scenefuse.pick.pick import pick
 
     _need_project("--configfile", "-h", "--help")
-    if _takes_own_settings() and not Path("Snakefile").is_file():
-        sys.argv += ["--configfile", str(OWN_SETTINGS)]
+    if not Path("Snakefile").is_file():
+        sys.argv += _settings_files()[1]
     run(pick)
 
 
@@ -99,22 +80,13 @@ def _need_project(*elsewhere: str) -> None:
         sys.exit(f"error: {where}; run this in a project that scenefuse init FOLDER made, or give --configfile")
 
 
-def _takes_own_settings() -> bool:
-    """Whether the project has settings of its own, and no others are given."""
-    return OWN_SETTINGS.is_file() and not any(word.startswith("--configfile") for word in sys.argv[1:])
-
-
-def _configfiles() -> list[Path]:
-    """The files after --configfile, or --configfiles; its values go on up to the next option."""
-    found, taking = list[Path](), False
-    for word in sys.argv[1:]:
-        name, equals, given = word.partition("=")
-        if word.startswith("-"):
-            taking = name in ("--configfile", "--configfiles")
-            found += [Path(given)] if taking and equals else []
-        elif taking:
-            found.append(Path(word))
-    return found
+def _settings_files() -> tuple[list[Path], list[str]]:
+    """The settings files of the command line, or the project's; and the words that name the latter to Snakemake."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--configfile", "--configfiles", nargs="+", type=Path, default=[])
+    given = parser.parse_known_args(sys.argv[1:])[0].configfile
+    own = [] if given or not OWN_SETTINGS.is_file() else [OWN_SETTINGS]
+    return given or own, ["--configfile", *map(str, own)] if own else []
 
 
 def _export() -> None:
@@ -139,20 +111,39 @@ def _export() -> None:
 
 
 def _run() -> None:
-    """run the workflow in this folder, by Snakemake and with its options"""
+    """run the workflow in this folder, by Snakemake and with its options
+
+    usage: scenefuse run [FILE ...] [OPTION ...]    in the folder of a project
+
+    Makes what is missing or no longer up to date: all, or the given files, as results/objects/NAME/fused.ply.
+
+      -n, --dry-run            say what would run, and why
+      --cores N                processor cores; all, where it is left out
+      --configfile FILE ...    settings in place of config/config.yaml
+      --directory FOLDER       the project, where it is not this folder
+      --forcerun RULE ...      make the outputs of a rule again
+      --until RULE ...         stop after a rule
+      --resources mem_mb=N     use no more memory than this
+      --profile FOLDER         on a cluster
+      --printshellcmds         print the command of each job
+      --report FILE.html       no run; a report of what made the results
+      --unlock                 go on after a run that was killed
+      --version                of Snakemake
+
+    All options are Snakemake's: python -m snakemake --help
+    """
     from scenefuse.complete import snakemake_command
     from scenefuse.core.stage import StageError
 
     if find_spec("snakemake") is None:
         raise ModuleNotFoundError(name="snakemake")
     if {"-h", "--help"} & set(sys.argv):
-        print(RUN_HELP, end="")
+        print(inspect.getdoc(_run))
         return
     # Options of Snakemake that say where the project is, or that none is needed.
     _need_project("--config", "--directory", "-d", "--version")
-    own = ["--configfile", str(OWN_SETTINGS)] if _takes_own_settings() else []
+    files, own = _settings_files()
     own += [] if any(word.startswith(PARALLEL) for word in sys.argv[1:]) else ["--cores", "all"]
-    files = _configfiles() or ([OWN_SETTINGS] if _takes_own_settings() else [])
     try:
         command = snakemake_command([*sys.argv[1:], *own], files)
     except StageError as error:

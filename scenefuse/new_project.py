@@ -10,7 +10,7 @@ from typing import Literal
 import tyro
 
 from scenefuse.cloud.formats import READERS
-from scenefuse.core.settings import ROOT, schema_of
+from scenefuse.core.settings import PACKAGE, ROOT, schema_of
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.tables import Row, read_table
 from scenefuse.photos.photo_files import VIDEO_SUFFIXES, in_folders, photo_files
@@ -23,21 +23,6 @@ COLUMNS = {
 SETTINGS = """\
 # Settings that differ from the shipped ones; `scenefuse run` reads this file. All of them, with their shipped values:
 # {root}/config/README.md
-"""
-README = """\
-# {name}
-
-1. `config/scenes.tsv` has a row for each scene: the folder of the drone's photos, or a cloud; or the photos, cameras
-   and dense cloud of a finished project of another program.
-2. `config/objects.tsv` has a row for each object: its scene and its close-up photos (a folder, a video), or a cloud.
-   Without a scene, an object's photos become a cloud by themselves.
-   In both tables, cells are separated by tabs; their columns are explained below.
-3. Say what the object is:
-   - for photos: `scenefuse pick --object {object}` opens a page to click on it;
-   - where the scene or the object is a cloud, and the scene shows much more than the object: name a text file in the
-     column `fiducials` with at least four points around the object, a line `x y z` each, in the scene's coordinates.
-4. `scenefuse run -n` says what would run, `scenefuse run` runs it; options are Snakemake's.
-5. With photos, look at `results/objects/{object}/masks.png` first; then open `results/summary/report.html`.
 """
 
 
@@ -74,7 +59,7 @@ def make_project(folder: Path, scene: Path | None, objects: Sequence[Path], pres
         raise StageError(f"{folder.resolve()} has braces, which Snakemake takes for wildcards; give another folder")
     rows = project_rows(folder, scene, objects)
     names = [row["object"] for row in rows[OBJECTS]] or ["NAME"]
-    text = README.format(name=folder.resolve().name, object=names[0])
+    text = (PACKAGE / "assets/project.md").read_text().format(name=folder.resolve().name, object=names[0])
     texts = {
         **{path.as_posix(): _table(COLUMNS[path], rows[path]) for path in rows},
         "config/config.yaml": SETTINGS.format(root=ROOT) + (ROOT / f"config/presets/{preset}.yaml").read_text(),

@@ -1,4 +1,4 @@
-"""A table of clicks on disk: every change is written at once, together with what others have written meanwhile."""
+"""A table of clicks on disk: every change is written at once."""
 
 import csv
 import hashlib
@@ -9,7 +9,7 @@ from pathlib import Path
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.tables import read_cells, read_text
 from scenefuse.marks.clicks import HEADERS, Click, Kind, ScenePoints, in_photos, read_length_clicks, read_points
-from scenefuse.pick.edits import Rows, merged
+from scenefuse.pick.edits import Rows
 
 
 class Document:
@@ -78,14 +78,12 @@ class Document:
         return digest(self.path) != self._digest
 
     def _take(self, rows: Rows) -> None:
-        """Write rows, with what others have added since, and hold them."""
+        """Write rows and hold them, unless others have written since."""
         if self.trouble:
             raise StageError(self.trouble)
         if self.changed_on_disk():
-            kind, theirs = self._on_disk()
-            if theirs and kind != self.kind:
-                raise StageError(f"{self.path} holds {kind} now, not {self.kind}: someone else has changed it")
-            rows = merged(self.rows, rows, theirs)
+            self.read()
+            raise StageError(f"{self.path} was changed by someone else just now, and read again; click once more")
         self._write(rows)
         self.rows, self._digest = rows, digest(self.path)
         self.version += 1

@@ -5,13 +5,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from scenefuse.core.stage import StageError
+from scenefuse.crop.crop_scene import MIN_FIDUCIALS
 from scenefuse.marks.clicks import Click, Kind, length_label
 
 # The two ends of a length that is new.
 ENDS = ("a", "b")
-MIN_BOX_PX = 4
-# Points that bound an object in the scene.
-MIN_POINTS = 4
 
 Rows = tuple[Click, ...]
 # Photo name -> (width, height), the pixels that clicks in it are in.
@@ -39,7 +37,7 @@ def with_box(rows: Rows, photo: str, corners: Corners, sizes: Sizes) -> Rows:
         StageError: next to nothing of it lies in the photo.
     """
     (x0, x1), (y0, y1) = (sorted(min(max(c[k], 0.0), sizes[photo][k]) for c in corners) for k in (0, 1))
-    if min(x1 - x0, y1 - y0) < MIN_BOX_PX:
+    if min(x1 - x0, y1 - y0) < 1:
         raise StageError(f"the box in {photo} is too small; drag it around the whole object")
     kept = tuple(row for row in rows if (row.label, row.photo) != ("box", photo))
     return (*kept, _in_photo("box", photo, x0, y0, sizes), _in_photo("box", photo, x1, y1, sizes))
@@ -106,16 +104,6 @@ def without_nearest(rows: Rows, photo: str, x: float, y: float, within_px: float
     return tuple(row for row in rows if row is not gone)
 
 
-def merged(base: Rows, mine: Rows, theirs: Rows) -> Rows:
-    """Theirs, with what I added to the base and without what I removed from it; a box or point that both moved is
-    mine."""
-    added, removed = [row for row in mine if row not in base], set(base) - set(mine)
-    replaced = {(row.label, row.photo) for row in added if row.label not in ("inside", "outside")}
-    kept = [row for row in theirs if row not in removed and (row.label, row.photo) not in replaced]
-    boxes = [row for row in mine if row.label == "box" and (row.label, row.photo) in replaced and row not in added]
-    return tuple(kept) + tuple(row for row in (*boxes, *added) if row not in kept)
-
-
 def problems(rows: Rows, kind: Kind, sizes: Sizes, min_inside: int = 1) -> list[str]:
     """What the workflow would refuse or leave out, a sentence each; nothing where it would go on.
 
@@ -141,7 +129,7 @@ def problems(rows: Rows, kind: Kind, sizes: Sizes, min_inside: int = 1) -> list[
     times = Counter(row.name for row in rows)
     found += [f"{name} is marked in one photo: click it in another one, too." for name in times if times[name] < 2]
     if kind == "points":
-        return found + [f"{len(times)} of at least {MIN_POINTS} points are marked."] * (len(times) < MIN_POINTS)
+        return found + [f"{len(times)} of at least {MIN_FIDUCIALS} points are marked."] * (len(times) < MIN_FIDUCIALS)
     ends = {(name, end) for name, _, end in (row.label.split("\t") for row in rows)}
     metres = {(name, long) for name, long, _ in (row.label.split("\t") for row in rows)}
     for name in dict.fromkeys(row.label.split("\t")[0] for row in rows):

@@ -15,7 +15,6 @@ from scenefuse.pick.edits import Sizes
 
 # A ray reaches so many times nearer and farther than the sparse points that the photo sees.
 RAY_REACH = 4
-RAY_SAMPLES = 200
 
 
 @dataclass(frozen=True)
@@ -45,6 +44,13 @@ class Cameras:
 
     def __contains__(self, photo: str) -> bool:
         return photo in self._images
+
+    def seen_pixels(self, photo: str) -> Array:
+        """(N, 2) pixels of a photo at which it sees sparse points."""
+        image = self._images[photo]
+        camera = self._model.cameras[image.camera_id]
+        pixels = np.array([point.xy for point in image.get_observation_points2D()]).reshape(-1, 2)
+        return pixels * self._sizes[photo] / np.array([camera.width, camera.height])
 
     def expected(self, clicks: Iterable[Click], photo: str) -> Expected | None:
         """Where the clicks on one point in other photos say that it is in this one; None where they say nothing."""
@@ -94,7 +100,7 @@ class Cameras:
         pose = image.cam_from_world().matrix()
         seen = np.array([self._model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()])
         depth = seen @ pose[2, :3] + pose[2, 3] if len(seen) else np.ones(1)
-        steps = np.geomspace(max(depth.min(), 1e-6) / RAY_REACH, RAY_REACH * depth.max(), RAY_SAMPLES)
+        steps = np.geomspace(max(depth.min(), 1e-6) / RAY_REACH, RAY_REACH * depth.max(), 200)
         return self._seen((ray * steps[:, None] - pose[:, 3]) @ pose[:, :3], photo)
 
     def _seen(self, points: Array, photo: str) -> Array:

@@ -1,5 +1,6 @@
 """The page: photos at the left, one of them large, and beside it what is marked and what comes next."""
 
+import importlib.resources
 from collections.abc import Callable
 from typing import Any
 
@@ -13,28 +14,7 @@ from scenefuse.pick.photo_tiles import BACKGROUND, Picture
 from scenefuse.pick.session import Session
 from scenefuse.pick.tables import Editor
 
-STYLE = """
-body { overflow: hidden; background: GREY; }
-.photo { width: 100%; height: 100%; }
-.photo.leaflet-container { background: GREY; cursor: crosshair; }
-.photo .leaflet-draw { display: none; }
-.leaflet-container { font: inherit; }
-.strip { width: 168px; overflow-y: auto; background: #2b2c30; }
-.thumb { position: relative; margin: 5px 6px; border: 2px solid transparent; border-radius: 4px; cursor: pointer; }
-.thumb img { width: 100%; height: 104px; object-fit: contain; display: block; border-radius: 2px; background: GREY; }
-.thumb.here { border-color: #ffd600; }
-.thumb .name { color: #e8eaed; font-size: 11px; overflow: hidden; text-overflow: ellipsis; white-space: nowrap; }
-.thumb .mark { position: absolute; top: 3px; padding: 0 6px; border-radius: 8px; color: #fff; font-size: 11px; }
-.thumb .clicks { left: 3px; background: #1565c0; }
-.thumb .score { right: 3px; background: #2e7d32; }
-.thumb .score.bad { background: #c62828; }
-.side { width: 300px; overflow-y: auto; background: #fff; padding: 10px 12px; gap: 8px; }
-.side > * { flex-shrink: 0; }
-.side .q-btn { text-transform: none; }
-.code { font: 11px/1.4 monospace; background: #f1f3f4; padding: 6px; border-radius: 4px; user-select: all;
-        overflow-wrap: anywhere; }
-kbd { font: 11px monospace; border: 1px solid #bdc1c6; border-radius: 3px; padding: 0 4px; background: #f8f9fa; }
-""".replace("GREY", BACKGROUND)
+ASSETS = importlib.resources.files("scenefuse.pick") / "assets"
 KEYS = {
     "i": "click inside",
     "o": "click outside",
@@ -47,7 +27,6 @@ KEYS = {
     "m": "show or hide masks",
     "t": "next table",
 }
-POLL_S = 1.0
 FAREWELL = "The clicks are saved, and this page has ended. What comes next is in the terminal."
 
 
@@ -64,7 +43,7 @@ class Page:
         self._editor: Editor | None = None
         self._shows_masks = True
         self._seen: Any = None
-        ui.add_css(STYLE)
+        ui.add_css((ASSETS / "page.css").read_text().replace("GREY", BACKGROUND))
         ui.colors(primary="#1565c0")
         ui.query(".nicegui-content").classes("p-0 gap-0")
         self._build()
@@ -103,7 +82,7 @@ class Page:
                     ui.html(f"<kbd>{key}</kbd>", sanitize=False)
                     ui.label(what).classes("text-sm")
         ui.keyboard(on_key=self._key, ignore=["input", "textarea"], repeating=False)
-        ui.timer(POLL_S, self._poll)
+        ui.timer(1.0, self._poll)
 
     async def begin(self) -> None:
         """Show the first photo: one with clicks, else the sharpest; once the browser is there."""

@@ -248,7 +248,8 @@ class MaskLayers:
             async with self._segmenting:
                 if clicked != self._clicked:
                     return
-                mask, notes = await asyncio.to_thread(self._session.segmenter.mask, picture, clicked[1])
+                shared = self._session.shared_pixels(picture.name)
+                mask, notes = await asyncio.to_thread(self._session.segmenter.mask, picture, clicked[1], shared)
             note = " ".join(f"{sentence[0].upper()}{sentence[1:]}." for sentence in notes)
             address = overlay(mask, COLOURS["inside"])
         except StageError as error:

@@ -21,8 +21,6 @@ TILE_PX = 256
 THUMBNAIL_PX = 320
 # Longer side of the photos that masks are made and shown in; SAM 2 sees no more.
 MASK_PX = 1024
-# Photos kept decoded, 200 MB each at 50 megapixels.
-KEPT_PYRAMIDS = 3
 # Beyond the photo's edges.
 BACKGROUND = "#202020"
 
@@ -103,7 +101,8 @@ class Tiles:
     """Tiles of photos, cut from pyramids of those that were looked at last."""
 
     def __init__(self) -> None:
-        self._read, self._lock = lru_cache(KEPT_PYRAMIDS)(_pyramid), threading.Lock()
+        # A decoded photo of 50 megapixels takes 200 MB.
+        self._read, self._lock = lru_cache(3)(_pyramid), threading.Lock()
 
     def tile(self, picture: Picture, zoom: int, column: int, row: int) -> bytes:
         """A tile of 256 x 256 pixels, as JPEG; grey beyond the photo's right and lower edge.

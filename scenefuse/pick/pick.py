@@ -18,32 +18,12 @@ from nicegui import app, ui
 
 from scenefuse.core.machine import has_screen
 from scenefuse.core.stage import StageError
-from scenefuse.pick.page import Page
+from scenefuse.pick.page import ASSETS, Page
 from scenefuse.pick.session import Session
 
 HOST = "127.0.0.1"
 
 
-# The page that everybody gets. It trades the token after # for the secret, which stays in this tab of this port, and
-# gets the page that holds photos by it.
-DOOR = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><title>scenefuse</title><body><script>
-const token = location.hash.slice(1), ask = (path, method, secret) =>
-  fetch(path, {method, cache: "no-store", headers: {"x-scenefuse": secret}});
-history.replaceState(null, "", "/");
-(async () => {
-  const known = sessionStorage.getItem("scenefuse");
-  let page = known && await ask("/", "GET", known);
-  if (!page?.ok && token) {
-    const entered = await ask("/enter", "POST", token);
-    if (entered.ok) {
-      sessionStorage.setItem("scenefuse", await entered.text());
-      page = await ask("/", "GET", sessionStorage.getItem("scenefuse"));
-    }
-  }
-  if (page?.ok) { const text = await page.text(); document.open(); document.write(text); document.close(); }
-  else document.body.innerText = "Open this page by what scenefuse pick printed last.";
-})();
-</script>"""
 SAFETY = {
     "content-security-policy": "frame-ancestors 'none'",
     "x-frame-options": "DENY",
@@ -184,7 +164,7 @@ class Guard:
             await self._app(scope, receive, send)
             return
         headers = {key.decode("latin-1"): value.decode("latin-1") for key, value in scope["headers"]}
-        answer = self._answer(scope, headers) if self._is_local(headers) else REFUSED
+        answer = self._answer(scope, headers) if self._is_local(headers) else _refusal()
 
         async def send_safely(message: Any) -> None:
             if message["type"] == "http.response.start":
@@ -201,20 +181,21 @@ class Guard:
         path, given = scope["path"], headers.get("x-scenefuse", "")
         if scope["type"] == "http" and path == "/enter":
             secret = self._entrance.enter(given)
-            return REFUSED if secret is None else PlainTextResponse(secret, headers={"cache-control": "no-store"})
+            return _refusal() if secret is None else PlainTextResponse(secret, headers={"cache-control": "no-store"})
         if path == "/" and not given:
-            return HTMLResponse(DOOR, headers={"cache-control": "no-store"})
+            return HTMLResponse((ASSETS / "door.html").read_text(), headers={"cache-control": "no-store"})
         if path == "/":
-            return None if _same(given, self._entrance.secret) else REFUSED
+            return None if _same(given, self._entrance.secret) else _refusal()
         key = parse_qs(scope["query_string"].decode("latin-1")).get("key", [""])[0]
-        return None if path.startswith(self._public) or _same(key, self._key) else REFUSED
+        return None if path.startswith(self._public) or _same(key, self._key) else _refusal()
 
     def _is_local(self, headers: dict[str, str]) -> bool:
         origin = headers.get("origin")
         return headers.get("host") in self._hosts and (origin is None or urlsplit(origin).netloc in self._hosts)
 
 
-REFUSED = PlainTextResponse("Open the page by what scenefuse pick printed last.", 403)
+def _refusal() -> Response:
+    return PlainTextResponse("Open the page by what scenefuse pick printed last.", 403)
 
 
 def _same(given: str, secret: str) -> bool:

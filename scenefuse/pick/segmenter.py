@@ -4,14 +4,18 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, scratch_directory, threads
+from scenefuse.core.transforms import Array
+from scenefuse.masks.prompts import pixel_of
 from scenefuse.pick.edits import Rows
 from scenefuse.pick.photo_tiles import MASK_PX, Picture, at_most, read_upright
 
@@ -141,15 +145,18 @@ class Segmenter:
         """End `compute_ahead`."""
         self._closed = True
 
-    def mask(self, picture: Picture, rows: Rows) -> tuple[Mask, list[str]]:
+    def mask(self, picture: Picture, rows: Rows, shared: Array | None = None) -> tuple[Mask, list[str]]:
         """(H, W) mask of a photo from its own clicks, at most MASK_PX large, and what is wrong with it.
+
+        Args:
+            picture: the photo.
+            rows: clicks, those in other photos too.
+            shared: (N, 2) pixels of its sparse points, once there are any; corners take their place before.
 
         Raises:
             StageError: the photo cannot be read.
         """
-        from scenefuse.masks.propagation import one_photo
         from scenefuse.masks.votes import MIN_AGREEMENT
-        from scenefuse.photos.workspace import View
 
         self.load()
         self._waiting += 1
@@ -159,15 +166,27 @@ class Segmenter:
                 pixels = self._pixels(picture)
                 height, width = pixels.shape[:2]
                 clicks = _clicks_of(picture, rows, width, height)
-                view = View(picture.name, np.eye(3), np.eye(4), width, height, pixels)
-                assert self._ask is not None
                 # As the workflow has it, in the undistorted photo.
                 size = min(self._photo_px, max(picture.width, picture.height))
                 tolerance_px = self._settings["max_click_residual_px"] * max(height, width) / size
-                mask, _, agreement, left_out = one_photo(self._ask, view, clicks, tolerance_px)
+                mask, agreement, left_out = self._query(picture.name, pixels, clicks, clicks, tolerance_px)
+                fewer = {"the box": replace(clicks, box=None)} if clicks.box is not None else {}
+                fewer["the last click"] = clicks.only(np.arange(len(clicks.pixels)) < len(clicks.pixels) - 1)
+                better = {
+                    what: found[1]
+                    for what, kept in fewer.items()
+                    if (agreement < 1 or left_out) and kept.prompt
+                    if (found := self._query(picture.name, pixels, kept, clicks, tolerance_px))[1] > agreement
+                }
         finally:
             self._waiting -= 1
-        notes = []
+        notes = [
+            f"without {what} it agrees with more of the clicks ({share:.2f}, now {agreement:.2f}): take it back (z)"
+            for what, share in better.items()
+        ]
+        known = corners(pixels) if shared is None else shared * [width / picture.width, height / picture.height]
+        if lies_in_nothing(mask, clicks.on, known):
+            notes.append("a click lies where other photos can share nothing, as in the sky: click on the object")
         if self.method == "GrabCut" and clicks.box is None and clicks.inside.all():
             notes.append("GrabCut separates colours: click beside the object too, or drag a box around it")
         if left_out:
@@ -177,6 +196,19 @@ class Segmenter:
             notes.append(f"it agrees with {agreement:.2f} of the clicks, at least {MIN_AGREEMENT} is needed")
         return mask, notes
 
+    def _query(
+        self, name: str, pixels: NDArray[np.uint8], clicks: "PhotoClicks", every: "PhotoClicks", tolerance_px: float
+    ) -> tuple[Mask, float, list[str]]:
+        """The mask from some clicks, how it agrees with all of them, and those of the some that it leaves out."""
+        from scenefuse.masks.prompts import Prompts, agreement
+        from scenefuse.masks.propagation import one_photo
+        from scenefuse.photos.workspace import View
+
+        assert self._ask is not None
+        view = View(name, np.eye(3), np.eye(4), pixels.shape[1], pixels.shape[0], pixels)
+        mask, _, _, left_out = one_photo(self._ask, view, clicks, tolerance_px)
+        return mask, agreement(mask, Prompts(every.on, every.off), tolerance_px), left_out
+
     def _pixels(self, picture: Picture) -> NDArray[np.uint8]:
         """The photo as the network sees it; always the same array while it is kept."""
         if picture.name not in self._photos:
@@ -185,6 +217,21 @@ class Segmenter:
             while len(self._photos) > KEPT_PHOTOS:
                 self._photos.popitem(last=False)
         return self._photos[picture.name]
+
+
+def corners(pixels: NDArray[np.uint8]) -> Array:
+    """(N, 2) corners in a photo (H, W, 3), by FAST: the sky has none."""
+    found = cv2.FastFeatureDetector_create().detect(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
+    return np.asarray(cv2.KeyPoint_convert(found), dtype=np.float64).reshape(-1, 2)
+
+
+def lies_in_nothing(mask: Mask, clicks: Array, known: Array) -> bool:
+    """Whether one of the clicks (N, 2) lies in a part of a mask (H, W) that holds none of the known pixels (M, 2)."""
+    # On its outline, the circle of seven pixels that FAST looks at shows what is beside it too.
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((7, 7), np.uint8))
+    _, parts = cv2.connectedComponents(inner)
+    at = [parts[rows, columns] for columns, rows in (pixel_of(clicks, mask), pixel_of(known, mask))]
+    return not set(at[0]) - {0} <= set(at[1])
 
 
 def _clicks_of(picture: Picture, rows: Rows, width: int, height: int) -> "PhotoClicks":

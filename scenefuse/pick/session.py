@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scenefuse.core.project import read_project
 from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import StageError, read_json
+from scenefuse.core.transforms import Array
 from scenefuse.photos.pictures import read_mask
 from scenefuse.photos.workspace import read_cameras
 from scenefuse.pick.photo_tiles import MASK_PX, Picture, Thumbnails, Tiles
@@ -89,6 +90,11 @@ class Session:
             return "left out", True
         score = masks.agreement.get(photo)
         return ("", False) if score is None else (f"{score:.2f}", False)
+
+    def shared_pixels(self, photo: str) -> Array | None:
+        """(N, 2) pixels of an object's photo that other photos share; None until the workflow has its camera."""
+        cameras = self.tables[0].cameras
+        return cameras.seen_pixels(photo) if cameras and photo in cameras else None
 
     def start(self) -> None:
         """Begin the work in the background: thumbnails, and features of the photos that come next."""

@@ -5,7 +5,6 @@ import pytest
 from scenefuse.core.stage import StageError
 from scenefuse.marks.clicks import Click, label_name
 from scenefuse.pick.edits import (
-    merged,
     point_name,
     problems,
     with_box,
@@ -68,21 +67,6 @@ def test_the_click_under_the_pointer_is_removed_and_no_other():
 
 def test_with_a_corner_the_whole_box_is_removed():
     assert without_nearest((HEAD, *BOX), "a.jpg", 29, 41, 5) == (HEAD,)
-
-
-def test_merging_keeps_what_both_added_and_drops_what_either_removed():
-    mine, theirs = (SKY, Click("inside", "a.jpg", 1, 1)), (HEAD, SKY, Click("inside", "a.jpg", 2, 2))
-    assert set(merged((HEAD, SKY), mine, theirs)) == {SKY, mine[1], theirs[2]}
-
-
-def test_merging_a_point_that_both_moved_keeps_one_and_it_is_mine():
-    base, mine, theirs = ((Click("hat", "a.jpg", x, 1),) for x in (1, 2, 3))
-    assert merged(base, mine, theirs) == mine
-
-
-def test_merging_a_box_that_both_drew_keeps_two_corners():
-    mine = with_box((), "a.jpg", ((1, 2), (50, 40)), SIZES)
-    assert merged((), mine, BOX) == mine
 
 
 @pytest.mark.parametrize(
