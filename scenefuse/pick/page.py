@@ -61,13 +61,13 @@ class Page:
             ui.label(session.name).classes("text-base font-bold").mark("object")
             self._tabs = ui.toggle(titles, value=0, on_change=lambda e: self._open_table(e.value))
             self._tabs.props("no-caps dense unelevated padding='2px 12px'").set_visibility(len(titles) > 1)
-            self._title = ui.label().classes("text-sm text-gray-700 ellipsis")
+            self._title = ui.label().classes("text-sm text-gray-700 ellipsis wide")
             ui.space()
-            self._state = ui.label().classes("text-sm text-gray-600")
+            self._state = ui.label().classes("text-sm text-gray-600 wide")
             ui.button(icon="help_outline", on_click=lambda: self._help.open()).props("dense flat round")
-        with ui.row().classes("w-full no-wrap gap-0").style("height: calc(100vh - 44px)"):
+        with ui.row().classes("parts w-full no-wrap gap-0").style("height: calc(100dvh - 44px)"):
             self._strip = PhotoStrip(session, self._open_photo)
-            with ui.element("div").classes("h-full").style("flex: 1 1 0; min-width: 0"):
+            with ui.element("div").classes("middle h-full").style("flex: 1 1 0; min-width: 0"):
                 self._map = PhotoMap(
                     lambda x, y: self._act(lambda: self._open.click(x, y)),
                     lambda x, y: self._act(lambda: self._open.remove(x, y, self._map.reach_px())),

@@ -189,7 +189,7 @@ class SidePanel:
 
     def _fill_next(self, editor: Editor) -> None:
         table, document = editor.table, editor.table.document
-        ui.label("What the workflow will make of it").classes("text-sm font-bold")
+        ui.label("What comes next").classes("text-sm font-bold")
         for problem in table.problems()[:6]:
             ui.label(problem).classes("text-xs text-orange-900")
         if any(row.photo not in table.pictures for row in document.rows):
@@ -199,7 +199,5 @@ class SidePanel:
             text = f"Write {document.path} into the column {table.column} of the table of {table.of}."
             ui.label(text).classes("text-xs text-orange-900")
         ui.button("Done", on_click=self._on_done).props("dense unelevated").classes("w-full")
-        ui.label("ends the page. Then scenefuse complete goes on by itself; in a terminal of the project:").classes(
-            "text-xs"
-        )
+        ui.label("Then scenefuse complete goes on by itself; by hand, in the project's folder:").classes("text-xs")
         ui.label(next_command(self._session.configfiles, table.result)).classes("code w-full").mark("command")
