@@ -213,7 +213,9 @@ def test_clicks_survive_a_reload_and_a_restart(page, browser, yard):
         again.marks(1)
 
 
-def test_two_pages_of_one_server_show_the_same(page, browser):
+def test_two_pages_of_one_server_show_the_same(page, browser, yard):
+    # Each address opens one page; the file has the next one.
+    page.address = re.search(r'url=(\S+?)"', (yard.path / "results/pick/open.html").read_text())[1]
     first = browser.window.current_window_handle
     browser.window.switch_to.new_window("tab")
     try:
