@@ -12,8 +12,8 @@ from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.crop.crop_cloud import (
-    LINK_FRACTION,
     MIN_PART_SHARE,
+    REACH_FRACTION,
     STRAY_SHARE,
     Crop,
     CropSettings,
@@ -24,17 +24,14 @@ from scenefuse.marks.clicks import Clicks
 from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
 from scenefuse.photos.workspace import View, read_views
 
-# A click has the depth of the points within this many spacings of the cloud around its ray, or pixels, if these are
-# more; of points up to so many spacings behind the nearest that is no stray: so many lie within these.
-RAY_SPACINGS, RAY_PX, DEPTH_SPACINGS, MIN_NEIGHBOURS = 2, 3, 8, 3
+# A click has the depth of the points within this many spacings of the cloud around its ray; of points up to so many
+# spacings behind the nearest that is no stray: so many lie within these.
+RAY_SPACINGS, DEPTH_SPACINGS, MIN_NEIGHBOURS = 2, 8, 3
 # What a click outside lies on is flat where this many points around it have at most this surface variation; then it is
 # what lies as near to their plane as points of one part lie to each other.
 PLANE_POINTS, MAX_VARIATION = 8, 0.02
 # Inside clicks with a depth that span an object.
 MIN_INSIDE = 3
-# Rounds in which the crop grows along the object; each reaches farther by its margin. One that adds no more than the
-# points of a part that would be left out is the last.
-MAX_ROUNDS = 25
 # The object reaches at most so much farther than its clicks, as a ratio of diagonals: clicks are spread over the side
 # that the photo shows. What is larger is connected with something else.
 MAX_GROWTH = 3.0
@@ -78,7 +75,7 @@ class SceneClicks:
             around = points[np.argsort(np.linalg.norm(points - click, axis=1), kind="stable")[:PLANE_POINTS]]
             spread, axes = np.linalg.eigh(np.cov(around.T))
             if spread[0] < MAX_VARIATION * spread.sum():
-                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < LINK_FRACTION * extent
+                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < REACH_FRACTION * extent
             found |= own
         return found
 
@@ -129,7 +126,7 @@ def _behind(pixels: Array, scene: TiledCloud, step: float, view: View) -> Rows:
     corners = [np.where(end, scene.high, scene.low) for end in np.ndindex(2, 2, 2)]
     at, depth = view.project(np.concatenate(corners))
     at, depth = at.reshape(8, -1, 2), depth.reshape(8, -1)
-    reach = np.maximum(RAY_PX, RAY_SPACINGS * step * float(view.intrinsics[0, 0]) / np.maximum(depth.min(0), step))
+    reach = np.maximum(1.0, RAY_SPACINGS * step * float(view.intrinsics[0, 0]) / np.maximum(depth.min(0), step))
     low, high = at.min(0) - reach[:, None], at.max(0) + reach[:, None]
     shown = ((pixels[:, None] >= low) & (pixels[:, None] <= high)).all(2).any(0)
     return np.flatnonzero((depth.max(0) > 0) & (shown | (depth.min(0) <= step)))
@@ -139,7 +136,7 @@ def _on_surface(points: Array, pixels: Array, depth: Array, pixel: Array, step: 
     """The middle (3,) of the nearest points (N, 3) that a photo shows about a pixel; None where there are none."""
     focal = float(view.intrinsics[0, 0])
     with np.errstate(divide="ignore"):
-        reach = np.maximum(RAY_PX, RAY_SPACINGS * step * focal / depth)
+        reach = np.maximum(1.0, RAY_SPACINGS * step * focal / depth)  # a pixel at least
     rows = np.flatnonzero((depth > 0) & (np.abs(pixels - pixel).max(1) <= reach))
     if not len(rows):
         return None
@@ -161,9 +158,9 @@ def _off_box(clicks: PhotoClicks, pixels: Array, depth: Array) -> NDArray[np.boo
 def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, other: NDArray[np.bool_]) -> Crop:
     """`crop_cloud` around clicks on one side of an object, grown along what they lie on, to its other sides (C5).
 
-    Each round takes the points of the last crop as its marks, until none are added. Growth ends at the ground, at gaps
-    and at points that are something else. Where the object is connected with something much larger, the box around the
-    clicks remains, and a note says so.
+    Each round takes the points of the last crop as its marks, until one adds no more than the points of a part that
+    would be left out. Growth ends at the ground, at gaps and at points that are something else. Where the object is
+    connected with something much larger, the box around the clicks remains, and a note says so.
 
     Args:
         scene: the dense cloud.
@@ -174,7 +171,7 @@ def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, o
     """
     first = cut = crop_cloud(scene, inside, up, settings, other)
     most = MAX_GROWTH * float(np.linalg.norm(np.ptp(inside, axis=0)))
-    for _ in range(MAX_ROUNDS):
+    while True:
         own = without_strays(scene.points[cut.keep], STRAY_SHARE / 2)  # in each round again
         if not len(own):
             return cut

@@ -13,20 +13,18 @@ from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop.crop_cloud import without_strays
 from scenefuse.geometry.depth_test import Where, depth_buffer, depth_test
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MAX_PHOTOS
 from scenefuse.geometry.visual_hull import least_framing
-from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
+from scenefuse.mvs.sparse_depths import MASK_REACH_PX
+from scenefuse.mvs.view_selection import MIN_SHARED_POINTS
 from scenefuse.photos.workspace import View, read_workspace, with_mask
 
-# Photos used at most, spread evenly: more show the same sides again.
-MAX_PHOTOS = 60
-# Masks are grown by this share of the photo's width, for what the similarity and the masks err by at outlines.
-MASK_GROWTH = 0.005
 # A point is hidden by one of its cell, this many spacings wide, that is more than this many cells nearer.
 CELL_SPACINGS, HIDDEN_CELLS = 4, 2
 # Where the photos stand farther from the object than so many of its extents, what hides it there is not looked for.
 MAX_DISTANCE_EXTENTS = 4.0
-# How near one of the object's own SfM points must be, as a share of their extent; how many of these are needed.
-MAX_OWN_DISTANCE, MIN_OWN = 0.15, 10
+# How near one of the object's own SfM points must be, as a share of their extent.
+MAX_OWN_DISTANCE = 0.15
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class Masked:
     """An object's photos with their masks.
 
     Attributes:
-        views: with `pixels` True on the mask, grown by 0.5 % of the photo's width.
+        views: with `pixels` True on the mask, grown by MASK_REACH_PX for what they and the similarity err by.
         own: (K, 3) SfM points on the object, in its frame.
     """
 
@@ -91,7 +89,7 @@ def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: floa
 
 
 def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
-    """At most 60 of an object's photos, spread evenly, with their masks, and the SfM points on the object.
+    """At most MAX_PHOTOS of an object's photos, spread evenly, with their masks, and the SfM points on the object.
 
     An SfM point is on the object when it is inside the mask in `min_share` of the photos that observe it, three or
     more; strays are left out.
@@ -122,17 +120,17 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
         observing[observed[rows]] += 1
         inside[observed[rows]] += one.pixels[pixels[:, 1], pixels[:, 0]]
     own = read.points[(observing >= CONFIRMING_PHOTOS) & (inside >= min_share * observing)]
-    if len(own) < MIN_OWN:
+    if len(own) < MIN_SHARED_POINTS:
         raise StageError(
-            f"only {len(own)} SfM points of {workspace} lie inside the masks of {masks}, {MIN_OWN} are needed; look at"
-            " the masks, and take sharper photos of the object"
+            f"only {len(own)} SfM points of {workspace} lie inside the masks of {masks},"
+            f" {MIN_SHARED_POINTS} are needed; look at the masks, and take sharper photos of the object"
         )
     return Masked(found, without_strays(own))
 
 
 def _with_grown_mask(view: View, path: Path) -> View:
     """The view with its mask, grown on all sides."""
-    extent = 2 * int(np.ceil(MASK_GROWTH * view.width)) + 1
+    extent = 2 * MASK_REACH_PX + 1
     grown = cv2.dilate(with_mask(view, path).pixels, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (extent, extent)))
     return replace(view, pixels=grown > 0)
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
-from scenefuse.fuse.measure import MIN_NEIGHBOURS, Measured
+from scenefuse.fuse.measure import MIN_NEIGHBOURS, RESOLUTION, Measured
 from scenefuse.geometry.depth_test import see
 from scenefuse.photos.workspace import View
 
@@ -33,25 +33,21 @@ REASONS = {
     Reason.SEEN_THROUGH: "photos see a surface behind it",
     Reason.REPLACED: "the object measured the place better",
 }
-# Share of the diagonal that a point must lie before or behind a surface to be seen through or hidden.
-MARGIN = 0.01
 # Photos that must see through a point, and the share of those that it is open to: a surface that is wrong itself lies
 # behind good points in some photos; a point that is not there has surfaces behind it in many.
 THROUGH_PHOTOS, THROUGH_SHARE = 2, 0.3
 # Points of both sides show the same place within so many of their common standard deviations, or so many spacings of
-# the sparser side where that is more; never farther than this share of the diagonal.
-SAME_PLACE_DEVIATIONS, SAME_PLACE_SPACINGS, MAX_SAME_PLACE = 5.0, 1.5, 0.02
+# the sparser side where that is more; never farther than twice the RESOLUTION.
+SAME_PLACE_DEVIATIONS, SAME_PLACE_SPACINGS = 5.0, 1.5
 # The object's points give way where the scene's standard deviation is smaller by more than this factor: they are the
 # denser ones, and equals would alternate. Where they are outnumbered, the scene's give way likewise.
 BETTER_FACTOR = 1.5
-# Standard deviations of the object within which a point that the scene did not measure may be right.
-CONSISTENT_DEVIATIONS = 3.5
 # Points of the scene for each of the object's, on the surface that both have, from which the scene is the denser.
 DENSER_FACTOR = 2.0
-# Side of the cells in which both sides' scatter is compared, over the diagonal, and in spacings of the sparser side
+# Side of the cells in which both sides' scatter is compared, in spacings of the sparser side, or twice the RESOLUTION
 # where that is more. Photos may confirm a point that is off, by chance; that a whole surface is rough shows beside the
 # other side's.
-ROUGH_SIDE, ROUGH_SPACINGS = 0.02, 4.0
+ROUGH_SPACINGS = 4.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +79,7 @@ def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.
     """
     diagonal = obj.cloud.diagonal
     surface = obj.cloud[obj.surface]
-    seen = see(scene.cloud.points, surface, views, spacing(surface.points), MARGIN * diagonal)
+    seen = see(scene.cloud.points, surface, views, spacing(surface.points), RESOLUTION * diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
     # What is measured stays: all photos of a pot before a wall have the wall behind it.
     is_open = seen.in_view - seen.hidden
@@ -91,7 +87,7 @@ def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.
     reason[through & ~scene.surface] = Reason.SEEN_THROUGH
 
     both = concatenate([surface, scene.cloud[scene.surface]])
-    behind = see(obj.cloud.points, both, views, spacing(both.points), MARGIN * diagonal)
+    behind = see(obj.cloud.points, both, views, spacing(both.points), RESOLUTION * diagonal)
     contradicted = ~obj.surface & (behind.through >= THROUGH_PHOTOS)
 
     worse, better = better_measured(obj, scene, diagonal, share)
@@ -119,7 +115,7 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float, share: floa
     fine = spacing(first.points)
     coarse = max(fine, spacing(points))
     if len(second):
-        rough, other_rough = _rougher(first, second, max(ROUGH_SIDE * diagonal, ROUGH_SPACINGS * coarse))
+        rough, other_rough = _rougher(first, second, max(2 * RESOLUTION * diagonal, ROUGH_SPACINGS * coarse))
         mine, other = np.hypot(mine, rough), np.hypot(other, other_rough)
     is_denser = _times_as_many(second.points, first.points, coarse) > DENSER_FACTOR * share
     factor = 1 / BETTER_FACTOR if is_denser else BETTER_FACTOR
@@ -130,7 +126,7 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float, share: floa
 
     def is_same(distance: Array, one: Array, two: Array, least: Array | float) -> Mask:
         common = np.hypot(one, np.where(np.isfinite(two), two, typical))
-        return np.asarray(distance <= np.clip(SAME_PLACE_DEVIATIONS * common, least, MAX_SAME_PLACE * diagonal))
+        return np.asarray(distance <= np.clip(SAME_PLACE_DEVIATIONS * common, least, 2 * RESOLUTION * diagonal))
 
     distance, partner = cKDTree(first.points).query(points, workers=threads())
     # A measured point of the scene is on the object's surface or beside it, on the ground for instance.
@@ -140,7 +136,7 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float, share: floa
     worse &= ~scene.surface | (_beside(points, first[partner]) <= coarse)
     if len(second):
         # What it did not measure may well be right where the object measures less exactly than the scene.
-        inexact = (mine[partner] > BETTER_FACTOR * typical) & (distance <= CONSISTENT_DEVIATIONS * mine[partner])
+        inexact = (mine[partner] > BETTER_FACTOR * typical) & (distance <= SAME_PLACE_DEVIATIONS * mine[partner])
         worse &= scene.surface | ~inexact
         distance, partner = cKDTree(second.points).query(first.points, workers=threads())
         # A better point of a sparser side stands for what lies within a spacing of the object's.

@@ -17,7 +17,6 @@ from scenefuse.fuse.compare import REASONS, Reason
 from scenefuse.fuse.measure import Evidence, unchecked
 from scenefuse.fuse.modes import (
     NEAR,
-    NEAR_SPACINGS,
     Checked,
     Fused,
     FusionSettings,
@@ -91,7 +90,7 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
     settings, notes = possible(settings, inputs.object_workspace is not None, inputs.scene_workspace is not None)
     placed, step = is_placed(registration), spacing(part.points)
     pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object"))) if placed else None
-    rows, scene = whole.near(*_region(obj, pose, crop_json, step))
+    rows, scene = whole.near(*_region(obj, pose, crop_json))
     checked: Checked | None = None
     if pose is None:
         print(f"the object is not fused: {value(registration, 'reason')}", flush=True)
@@ -121,14 +120,14 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
         write_json(outputs.frames, ledger | {"status": content["registration"]})
 
 
-def _region(obj: Cloud, pose: Sim3 | None, crop_json: dict[str, Any], step: float) -> tuple[Array, Array]:
+def _region(obj: Cloud, pose: Sim3 | None, crop_json: dict[str, Any]) -> tuple[Array, Array]:
     """Corners (3,) of the part of the scene that fusion reads: the crop's box, and what is near the object in place."""
     scene_from_level = Sim3(1.0, np.array(value(crop_json, "level_from_scene")).T, np.zeros(3))
     low, high = box_around(value(crop_json, "box_low"), value(crop_json, "box_high"), scene_from_level)
     if pose is None:
         return low, high
     placed = obj.transformed(pose)
-    reach = NEAR * placed.diagonal + NEAR_SPACINGS * step
+    reach = NEAR * placed.diagonal
     return np.minimum(low, placed.points.min(0) - reach), np.maximum(high, placed.points.max(0) + reach)
 
 

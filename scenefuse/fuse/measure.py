@@ -27,9 +27,12 @@ class Evidence(IntEnum):
 
 FIELDS = ("photos", "match", "deviation", "world_deviation", "evidence")
 """What is known of a point: photos that confirm it, mean NCC of the best, one standard deviation, and one of these."""
+# Share of the object's diagonal that fusion resolves: how far a point lies before or behind a surface to be seen
+# through or hidden, what its neighbours are, and the side of the cells in which missing surface is counted.
+RESOLUTION = 0.01
 # A point is measured where photos confirm this share of it and its neighbours: here and there one matches by chance.
-# Neighbours are as many as a plane has within SUPPORT_RADIUS of the object's diagonal, from MIN_ to MAX_NEIGHBOURS.
-SUPPORT, SUPPORT_RADIUS, MIN_NEIGHBOURS, MAX_NEIGHBOURS = 0.5, 0.01, 8, 64
+# Neighbours are as many as a plane has within RESOLUTION, from MIN_ to MAX_NEIGHBOURS.
+SUPPORT, MIN_NEIGHBOURS, MAX_NEIGHBOURS = 0.5, 8, 64
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ def supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> ND
     if not measured.any():
         return measured
     step = spacing(points)
-    on_plane = np.pi * (SUPPORT_RADIUS * diagonal / step) ** 2 if step > 0 else MAX_NEIGHBOURS
+    on_plane = np.pi * (RESOLUTION * diagonal / step) ** 2 if step > 0 else MAX_NEIGHBOURS
     count = min(int(np.clip(on_plane, MIN_NEIGHBOURS, MAX_NEIGHBOURS)) + 1, len(points))
     near = cKDTree(points).query(points[measured], k=count, workers=threads())[1]
     found = measured.copy()

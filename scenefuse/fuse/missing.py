@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
-from scenefuse.fuse.compare import MARGIN, THROUGH_PHOTOS
+from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, THROUGH_PHOTOS
+from scenefuse.fuse.measure import RESOLUTION
 from scenefuse.geometry.depth_test import see, shown_in
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, match_in
 from scenefuse.geometry.visual_hull import Outline, count_silhouettes
@@ -30,10 +31,8 @@ class Lack(IntEnum):
     CONTRADICTED = 3
 
 
-# Cells along the object's diagonal; so many around its points are looked at too.
-CELLS, BORDER_CELLS = 100, 3
-# A cell is covered by points of the completed scene within so many sides of it.
-COVERED_SIDES = 1.5
+# So many cells around the object's points are looked at too.
+BORDER_CELLS = 3
 # Share of the photos that may have a place of the hull outside their mask: masks err.
 MAX_OFF_MASK = 0.1
 # Share of the photos with a place in their picture that must see it for it to be empty off the masks.
@@ -87,11 +86,11 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
         photos: the object's and the scene's, in the scene's frame.
         masks: the object's cameras in the scene's frame with masks (H, W) as pixels; none leaves the second out.
     """
-    side, margin = obj.diagonal / CELLS, MARGIN * obj.diagonal
+    side = margin = RESOLUTION * obj.diagonal
     views = photos[0].views + photos[1].views
     surface = _plain(voxel_downsample(completed, side / 2))
     step = spacing(surface.points, quantile=SPARSEST)
-    apart = cKDTree(surface.points).query(obj.points, workers=threads())[0] > COVERED_SIDES * side
+    apart = cKDTree(surface.points).query(obj.points, workers=threads())[0] > SAME_PLACE_SPACINGS * side
     loose = _plain(obj[apart])
     through = see(loose.points, surface, views, step, margin).through >= THROUGH_PHOTOS
     through |= _off_masks(loose.points, masks)
@@ -166,7 +165,7 @@ def _frontier(
     # Off the masks nothing of the object is, where photos see the place at all; below the ground few do, through gaps.
     in_sight = seen.in_view - seen.hidden >= np.maximum(THROUGH_PHOTOS, MIN_IN_SIGHT * seen.in_view)
     empty = (seen.through >= THROUGH_PHOTOS) | (~in_hull & in_sight)
-    bare = ~grid.within(surface.points, COVERED_SIDES * grid.side)
+    bare = ~grid.within(surface.points, SAME_PLACE_SPACINGS * grid.side)
     free = empty.reshape(grid.shape) & bare
     unknown = (in_hull & ~empty).reshape(grid.shape) & bare
     edge = unknown & ndimage.binary_dilation(free)

@@ -31,12 +31,7 @@ from scenefuse.fuse.write import GAINS, MIN_PAIRS, SEAM_SPACINGS, Changes, feath
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, moved_photos
 from scenefuse.register.uncertainty import Uncertainty
 
-# Points farther than SAME_PLACE_SPACINGS of the scene from all of its points are new to it, or so many median distances
-# between the clouds where both exist, if that is more: noise does not add a second layer.
-FILL_RESIDUALS = 1.5
-# Points of the scene within so many of its spacings of the object's box are compared with it.
-NEAR_SPACINGS = 10.0
-# The scene is checked in the object's box, widened by this share of its diagonal.
+# The scene is compared in the object's box, widened by this share of its diagonal.
 NEAR = 0.05
 # Points of the scene around an object that are checked; of a denser scene a random choice, which the others follow.
 MAX_CHECKED = 1_000_000
@@ -247,14 +242,14 @@ def fuse_by_distance(obj: Cloud, scene: Cloud, part: Cloud, pose: Sim3, settings
     moved, step = obj.transformed(pose), spacing(part.points)
     if scene.normals is not None:
         moved = with_normals(moved)
-    low, high = moved.points.min(0) - NEAR_SPACINGS * step, moved.points.max(0) + NEAR_SPACINGS * step
-    near = np.flatnonzero(((scene.points >= low) & (scene.points <= high)).all(1))
+    near = np.flatnonzero(around(scene, moved))
     near = near if len(near) else np.arange(len(scene))
     distance = cKDTree(scene.points[near]).query(moved.points, workers=threads())[0]
+    # Where both exist, noise does not add a second layer.
     fill = SAME_PLACE_SPACINGS * step
     overlap = distance <= 3 * fill
     if overlap.sum() > MIN_PAIRS:
-        fill = max(fill, FILL_RESIDUALS * float(np.median(distance[overlap])))
+        fill = max(fill, SAME_PLACE_SPACINGS * float(np.median(distance[overlap])))
     moved, gain, bias = with_colors_of(moved, scene[near], fill, settings.match_colors)
     removed = near[:0]
     if settings.mode == "fill":

@@ -15,6 +15,7 @@ from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample
 from scenefuse.core.transforms import UP, Array, look_at, rotation_between
 from scenefuse.fuse.missing import SPARSEST, Lack, Missing
 from scenefuse.geometry.depth_test import shown_in
+from scenefuse.geometry.photo_kernel import GOOD_ANGLE
 from scenefuse.photos.workspace import View
 
 # Directions that are tried, spread evenly over a sphere around the object, at these distances, in those of its
@@ -22,12 +23,8 @@ from scenefuse.photos.workspace import View
 DIRECTIONS, DISTANCES, MIN_ELEVATION_DEG = 120, (0.7, 1.0, 1.4), -25.0
 # Share of the object's diagonal that a camera stays away from the ground and everything else.
 CLEARANCE = 0.05
-# Between the three photos of a station, so that they locate what they show.
-STATION_ANGLE_DEG = 10.0
 # What is nearer to the object's middle than so many diagonals hides by depth buffers, the rest by lines of sight.
 BESIDE_DIAGONALS = 0.6
-# A photo from nearer to the direction of one that there is shows contradicted surface no better.
-MIN_NEW_ANGLE_DEG = 15.0
 # Stations at most, and the share of what is missing that one must add.
 MAX_STATIONS, MIN_GAIN = 6, 0.05
 
@@ -37,7 +34,7 @@ class Station:
     """A place to take photos from.
 
     Attributes:
-        photos: three cameras beside each other, in the scene's frame, that look at the object.
+        photos: three cameras beside each other, GOOD_ANGLE apart, in the scene's frame, that look at the object.
         shows: share of the surface worth photographing that all three show, and no station before.
     """
 
@@ -155,7 +152,7 @@ def _photos_from(place: Array, middle: Array, lens: View, up: Array) -> list[Vie
     axis = up - (up @ away) / (away @ away) * away
     axis /= np.linalg.norm(axis)
     photos = []
-    for number, angle in enumerate(np.radians(STATION_ANGLE_DEG) * np.array([-1, 0, 1]), 1):
+    for number, angle in enumerate(GOOD_ANGLE * np.array([-1, 0, 1]), 1):
         eye = middle + np.cos(angle) * away + np.sin(angle) * np.cross(axis, away)
         pose = np.eye(4)
         pose[:3, :3] = look_at(eye, middle, up)
@@ -167,7 +164,7 @@ def _photos_from(place: Array, middle: Array, lens: View, up: Array) -> list[Vie
 def _tried(
     photos: list[list[View]], cells: Cloud, close_ups: list[View], obstacles: Cloud, step: float, margin: float
 ) -> NDArray[np.bool_]:
-    """(P, K) contradicted cells that a close-up shows from nearly the same direction as the P stations would."""
+    """(P, K) contradicted cells that a close-up shows from less than GOOD_ANGLE beside the P stations."""
     tried = np.zeros((len(photos), len(cells)), dtype=bool)
     rows = np.flatnonzero(cells.fields["missing"] == Lack.CONTRADICTED)
     if len(rows) == 0:
@@ -177,7 +174,7 @@ def _tried(
     toward = np.array([_directions(part.points, three[1].centre) for three in photos]).reshape(-1, len(rows), 3)
     for view in close_ups:
         known = shown_in(part.points, part.normals, obstacles, view, step, margin)
-        beside = (toward * _directions(part.points, view.centre)).sum(2) > np.cos(np.radians(MIN_NEW_ANGLE_DEG))
+        beside = (toward * _directions(part.points, view.centre)).sum(2) > np.cos(GOOD_ANGLE)
         tried[:, rows] |= beside & known
     return tried
 

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
+from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.geometry.icp import ScaleRange, refine_planes
 from scenefuse.geometry.surface import Surface, with_queries
 from scenefuse.register.decision import FineSettings
@@ -19,16 +20,14 @@ from scenefuse.register.uncertainty import Uncertainty
 REACHES = (0.04, 0.02, 0.01)
 # The scale stays within five per cent of what the registration found.
 SCALE_WIDTH = 0.05
-# Measured points that each side needs; of each side at most so many, drawn evenly, and of these those that look for a
-# partner. They are not averaged, which would round corners off.
-MIN_POINTS, MAX_POINTS, MAX_QUERIES = 200, 20000, 5000
+# Of each side's points so many at most, drawn evenly, look for a partner among four times as many. They are not
+# averaged, which would round corners off.
+MAX_QUERIES = 5000
 # An object that moves by more than this share of its diagonal was put at a wrong place, however certain that seemed.
 MIN_MISPLACED = FineSettings.max_translation_sd_fraction
 # Halves of the surfaces that are settled alike, and how far their poses may spread, over the diagonal, for the scale to
 # be settled too: a roof alone does not determine how large a house is.
 HALVES, MAX_SPREAD = 6, 0.003
-# Halves begin this much too large or too small, so that a scale that stays where it is put shows itself.
-START_SCALE_FACTOR = 1.03
 
 
 def settle(
@@ -77,7 +76,7 @@ def _refined(mine: Surface, theirs: Surface, scale_width: float, diagonal: float
 def _surface(cloud: Cloud, seed: int) -> Surface:
     """A cloud made ready for refinement."""
     rng = np.random.default_rng(seed)
-    thin = cloud[np.sort(rng.permutation(len(cloud))[:MAX_POINTS])]
+    thin = cloud[np.sort(rng.permutation(len(cloud))[: 4 * MAX_QUERIES])]
     colors = None if thin.colors is None else thin.colors / 255.0
     assert thin.normals is not None
     normals = thin.normals.astype(np.float64)
@@ -112,7 +111,8 @@ def half_sampling(
         half = _half(obj, scene, pose, edge, rng)
         if half is None:
             return None
-        factor = START_SCALE_FACTOR if k % 2 else 1 / START_SCALE_FACTOR
+        # A scale that stays where it is put shows itself.
+        factor = 1 + SCALE_WIDTH if k % 2 else 1 / (1 + SCALE_WIDTH)
         start = Sim3(factor, np.eye(3), (1 - factor) * pose.apply(centre)) @ pose
         other = refine_planes(*half, start, scales, tau, rounds=30)
         deviations[k, :3] = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()

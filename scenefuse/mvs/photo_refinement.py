@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import back_project
 from scenefuse.geometry.matcher import Matcher
-from scenefuse.mvs.plane_sweep import refine_by_matching
+from scenefuse.mvs.plane_sweep import DepthMapSettings, refine_by_matching
 from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import View
 
-# Photos that a photo is matched with, and of these the ones that count: others may not see the place.
-SOURCES, BEST_SOURCES = 8, 3
 # Between two photos: enough baseline to measure, little enough to look alike.
 BEST_ANGLE_DEG = 15.0
 # Places of a photo's depth map that other photos are chosen by; behind another's surface by this share of its depth, a
@@ -79,7 +77,9 @@ def refine_by_photos(views: Views, depths: NDArray[np.float32], settings: Refine
         bottom, right = (min(end.max() + pad + 1, side) for end, side in zip((rows, columns), views.sizes[index]))
         part = np.s_[top:bottom, left:right]
         near = [photos[s] for s in sources[index]]
-        matcher = Matcher(_cut(photos[index], top, left, bottom, right), near, BEST_SOURCES, window, device)
+        matcher = Matcher(
+            _cut(photos[index], top, left, bottom, right), near, DepthMapSettings.best_sources, window, device
+        )
         found = refine_by_matching(matcher, depth[part], settings.match_reach_px, settings.match_min_score)
         result.depths[index][part], result.moved[index][part], result.inconsistent[index][part] = found
     return result
@@ -116,7 +116,7 @@ def choose_sources(views: Views, depths: NDArray[np.float32]) -> NDArray[np.int6
         off = np.abs(_angles_deg(centres - middles, centres[index] - middles) - BEST_ANGLE_DEG)
         worth[:, index] = share / (1 + off / BEST_ANGLE_DEG)
     np.fill_diagonal(worth, -np.inf)
-    return np.argsort(-worth, axis=1, kind="stable")[:, : min(SOURCES, len(poses) - 1)]
+    return np.argsort(-worth, axis=1, kind="stable")[:, : min(DepthMapSettings.sources, len(poses) - 1)]
 
 
 def _angles_deg(a: Array, b: Array) -> Array:

@@ -35,9 +35,9 @@ MIN_TEXTURE = 2 / 255
 # A match must be worse this far beside it, in pixels of the middle one of the source photos: a high correlation alone
 # says little, as a shaded wall matches at all depths.
 PEAK_DISTANCE_PX = 1.5
-# Largest share of blank pixels among those around that look alike, in windows of this side, twice over: the glow beside
+# Largest share of blank pixels among those around that look alike, in windows of NORMAL_PX, twice over: the glow beside
 # an edge lies at the rim of a blank sky.
-MAX_BLANK_SHARE, SUPPORT_PX = 0.25, 11
+MAX_BLANK_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -313,7 +313,7 @@ def is_measured(matcher: Matcher, inverse: Tensor, score: Tensor, min_score: flo
 
 def _among_blank(matcher: Matcher, measured: Tensor) -> Tensor:
     """True (h, w) where of the pixels around that look alike too many have neither texture nor a measurement."""
-    weights = support_weights(matcher.reference, SUPPORT_PX)
+    weights = support_weights(matcher.reference, NORMAL_PX)
     known, blank = measured.float(), (~measured & (matcher.variance < matcher.flat)).float()
     for _ in range(2):
         known, blank = (supported_mean(values, weights) for values in (known, blank))

@@ -6,14 +6,15 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
 from scenefuse.core.transforms import Array
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.photos.views import Views
 
 # Longest side of a triangle between sparse points, over the photo's; farther apart they need not be one surface.
 MAX_TRIANGLE_SIDE = 0.06
 # Sparse points off the mask, but this near to it, may be the object's: they are left out.
 MASK_REACH_PX = 2
-# Photos that have a sparse point of the object on their masks, and their share of all that observe it.
-CONFIRMING_PHOTOS, MIN_ON_MASK_SHARE = 3, 0.8
+# Share of the photos that observe a sparse point of the object that have it on their masks.
+MIN_ON_MASK_SHARE = 0.8
 # What hides a point of the object is this much nearer, as a share of its depth: between such points it may bulge.
 BULGE_SHARE = 0.02
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.geometry.visual_hull import (
     MIN_OWN_POINTS,
     MIN_WHOLE_SHARE,
@@ -18,7 +19,6 @@ from scenefuse.geometry.visual_hull import (
     is_whole,
     least_framing,
 )
-from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.nerf.rays import SURFACE_DEPTH, dilate
 from scenefuse.photos.workspace import View
 

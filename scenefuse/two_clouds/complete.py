@@ -23,7 +23,7 @@ from scenefuse.core.transforms import Sim3
 from scenefuse.core.version import VERSION
 from scenefuse.fuse.fuse_object import possible
 from scenefuse.fuse.measure import unchecked
-from scenefuse.fuse.modes import NEAR_SPACINGS, FusionSettings, color_notes, fuse_by_distance
+from scenefuse.fuse.modes import NEAR, FusionSettings, color_notes, fuse_by_distance
 from scenefuse.fuse.write import (
     Changes,
     Source,
@@ -86,8 +86,9 @@ def complete(
     """
     start = time.perf_counter()
     settings, notes = possible(settings, False, False)
-    moved, reach = scene_from_object.apply(obj.points), max(NEAR_SPACINGS * spacing(scene.part.points), around)
-    rows, near = scene.near(moved.min(0) - reach, moved.max(0) + reach)
+    moved = obj.transformed(scene_from_object)
+    reach = max(NEAR * moved.diagonal, around)
+    rows, near = scene.near(moved.points.min(0) - reach, moved.points.max(0) + reach)
     fused = fuse_by_distance(obj, near, scene.part if scene.every == 1 else near, scene_from_object, settings)
     fused, of_colors = color_notes(fused, obj, near)
     notes += of_colors

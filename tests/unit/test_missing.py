@@ -38,7 +38,7 @@ def photographed(arc, count=24, waves=30.0):
 @pytest.fixture(autouse=True)
 def coarse_cells(monkeypatch):
     """Cells of an 80th of the diagonal, for speed."""
-    monkeypatch.setattr("scenefuse.fuse.missing.CELLS", 80)
+    monkeypatch.setattr("scenefuse.fuse.missing.RESOLUTION", 1 / 80)
 
 
 def ball(count=14000):
