@@ -33,6 +33,8 @@ REASONS = {
     Reason.SEEN_THROUGH: "photos see a surface behind it",
     Reason.REPLACED: "the object measured the place better",
 }
+# How far a point must lie before or behind a surface to be seen through or hidden, as a share of the diagonal.
+MARGIN = RESOLUTION
 # Photos that must see through a point, and the share of those that it is open to: a surface that is wrong itself lies
 # behind good points in some photos; a point that is not there has surfaces behind it in many.
 THROUGH_PHOTOS, THROUGH_SHARE = 2, 0.3
@@ -79,7 +81,7 @@ def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.
     """
     diagonal = obj.cloud.diagonal
     surface = obj.cloud[obj.surface]
-    seen = see(scene.cloud.points, surface, views, spacing(surface.points), RESOLUTION * diagonal)
+    seen = see(scene.cloud.points, surface, views, spacing(surface.points), MARGIN * diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
     # What is measured stays: all photos of a pot before a wall have the wall behind it.
     is_open = seen.in_view - seen.hidden
@@ -87,7 +89,7 @@ def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.
     reason[through & ~scene.surface] = Reason.SEEN_THROUGH
 
     both = concatenate([surface, scene.cloud[scene.surface]])
-    behind = see(obj.cloud.points, both, views, spacing(both.points), RESOLUTION * diagonal)
+    behind = see(obj.cloud.points, both, views, spacing(both.points), MARGIN * diagonal)
     contradicted = ~obj.surface & (behind.through >= THROUGH_PHOTOS)
 
     worse, better = better_measured(obj, scene, diagonal, share)
