@@ -29,6 +29,7 @@ LACK_OF_MEMORY = re.compile(
     "^MemoryError|bad_alloc|[Cc]annot allocate memory|can't allocate memory|failed to map segment|ould not load.*llvm"
     r"|Unable to allocate|can't start new thread|what\(\): +Resource temporarily unavailable"
 )
+STOPPED = "from outside, as Ctrl-C or a time limit does; run again to go on"
 
 
 class StageError(Exception):
@@ -268,9 +269,7 @@ def _exit_on_signal(number: int, _frame: Any) -> None:
 
 def stopped_by(number: int) -> str:
     """What a stage that a signal ends says."""
-    return (
-        f"stopped by {signal.Signals(number).name} from outside, as Ctrl-C or a time limit sends it; run again to go on"
-    )
+    return f"stopped by {signal.Signals(number).name} {STOPPED}"
 
 
 @contextlib.contextmanager

@@ -2,7 +2,7 @@
 import subprocess
 
 from scenefuse.core.job_records import why_ended
-from scenefuse.core.stage import own_sigterm, remove_leftovers
+from scenefuse.core.stage import STOPPED, own_sigterm, remove_leftovers
 from scenefuse.report.run_summary import (
     OBJECT_FILES,
     REGISTRATION_FILES,
@@ -224,8 +224,10 @@ def failed_logs():
     return f" --failed-logs {' '.join(logs)}" if logs else ""
 
 
-def print_failures():
-    """Print what failed, and why."""
+def print_failures(stopped):
+    """Print what failed, and why; `stopped` is whether a signal ended the run."""
+    if stopped:
+        print(f"failed: the run was stopped {STOPPED}", file=sys.stderr)
     started = os.fstat(run_lock.fileno()).st_mtime
     for job in sorted(jobs_that_ended_badly(), key=lambda job: job.jobid):
         for log in job.log:

@@ -272,5 +272,5 @@ onerror:
         run_anyway(job)
     for job in held_up("write_report") if keep_going else []:
         run_anyway(job)
-    print_failures()
+    print_failures(stopped)
     print(closing_lines(), file=sys.stderr)
