@@ -191,6 +191,7 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         import pycolmap
 
     try:
+        _require_whole_points(folder / "points3D.bin")
         model = pycolmap.Reconstruction(folder)
         _require_whole_cameras(folder / "cameras.bin", model)
         return model
@@ -206,6 +207,19 @@ def _require_whole_cameras(path: Path, model: pycolmap.Reconstruction) -> None:
         size = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
         if path.stat().st_size < size:
             raise ValueError(f"{path.name} is cut short: {path.stat().st_size} of {size} bytes")
+
+
+def _require_whole_points(path: Path) -> None:
+    """Raise ValueError where points3D.bin is cut short: COLMAP takes whatever stands in memory for the length of a
+    track, and may ask for all memory."""
+    if path.is_file():
+        content = path.read_bytes()
+        left, at = int.from_bytes(content[:8], "little"), 8
+        # Number, position, colour and error of a point, and the length of its track, whose elements have 8 bytes each.
+        while left and at + 51 <= len(content):
+            left, at = left - 1, at + 51 + 8 * int.from_bytes(content[at + 43 : at + 51], "little")
+        if left or at > len(content):
+            raise ValueError(f"{path.name} is cut short")
 
 
 def read_cameras(folder: Path) -> dict[str, pycolmap.Camera]:

@@ -121,3 +121,13 @@ def test_cameras_that_are_cut_short_are_an_error(folder):
     path.write_bytes(path.read_bytes()[:-16])
     with pytest.raises(StageError, match=r"sparse is not a readable COLMAP model \(cameras\.bin is cut short"):
         read_model(folder / "sparse")
+
+
+def test_points_that_are_cut_short_are_an_error_before_they_take_memory(folder):
+    path = folder / "sparse/points3D.bin"
+    assert read_model(folder / "sparse").num_points3D() == 3
+    whole = path.read_bytes()
+    for damaged in (whole[:-1], whole[:20], whole[:51] + b"\xff" * 8 + whole[59:]):
+        path.write_bytes(damaged)
+        with pytest.raises(StageError, match=r"\(points3D\.bin is cut short\)"):
+            read_model(folder / "sparse")

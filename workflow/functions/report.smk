@@ -231,7 +231,7 @@ def print_failures(stopped):
     started = os.fstat(run_lock.fileno()).st_mtime
     for job in sorted(jobs_that_ended_badly(), key=lambda job: job.jobid):
         for log in job.log:
-            why = why_ended(Path(log), Path(job.benchmark), started)
+            why = why_ended(Path(log), Path(job.benchmark or ""), started)
             about = job.message or job.rule.name
             print(f"failed: {about}: {why} [{log}]", file=sys.stderr)
 
