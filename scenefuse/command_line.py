@@ -165,6 +165,7 @@ def _complete() -> None:
 # The rule of each thing that is handed over, and its target.
 EXPORTS = {
     "surface": ("make_surface", "results/objects/{object}/surface.json"),
+    "drawings": ("draw_surface", "results/objects/{object}/drawings"),
 }
 PARTS: dict[str, Callable[[], None]] = {
     "complete": _complete,

@@ -6,6 +6,7 @@ Sources: glTF 2.0 (Khronos), EXT_mesh_features (Cesium), KHR_materials_unlit (ph
 import io
 import json
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,49 @@ def write_glb(
     body = b"".join(struct.pack("<I4s", len(data), name) + data for name, data in chunks)
     with atomic_file(path) as temporary:
         temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+
+
+@dataclass(frozen=True)
+class Painted:
+    """A mesh with its picture, as a GLB holds it, z up again.
+
+    Attributes:
+        points: (V, 3) metres.
+        faces: (F, 3).
+        uv: (V, 2) places in the picture, from its upper left, 0..1.
+        picture: (H, W, 3) uint8.
+    """
+
+    points: Array
+    faces: NDArray[np.int64]
+    uv: Array
+    picture: NDArray[np.uint8]
+
+
+def read_painted(path: Path) -> Painted | None:
+    """The painted part of what `write_glb` wrote; None where nothing is."""
+    data = path.read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    content, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
+    if "images" not in content:
+        return None
+
+    def view(number: int) -> bytes:
+        entry = content["bufferViews"][number]
+        return binary[entry["byteOffset"] : entry["byteOffset"] + entry["byteLength"]]
+
+    parts, count = list[tuple[Array, NDArray[np.int64], Array]](), 0
+    for primitive in content["meshes"][0]["primitives"]:
+        names = primitive["attributes"]
+        if "TEXCOORD_0" in names:
+            numbers = (names["POSITION"], primitive["indices"], names["TEXCOORD_0"])
+            points, faces, uv = (view(content["accessors"][number]["bufferView"]) for number in numbers)
+            positions = np.frombuffer(points, "<f4").reshape(-1, 3) @ Y_UP_FROM_Z_UP
+            triangles = np.frombuffer(faces, "<u4").astype(np.int64).reshape(-1, 3) + count
+            parts.append((positions, triangles, np.frombuffer(uv, "<f4").reshape(-1, 2).astype(np.float64)))
+            count += len(positions)
+    picture = np.asarray(Image.open(io.BytesIO(view(content["images"][0]["bufferView"]))).convert("RGB"))
+    return Painted(*(np.concatenate(part) for part in zip(*parts)), picture)
 
 
 def _primitive(buffer: _Buffer, part: Surface, kind: FaceClass, metres: float, uv: Array | None) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from scenefuse.cloud.clouds import Cloud, write_cloud
@@ -14,6 +15,7 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.core.transforms import look_at
 from scenefuse.fuse.measure import Evidence
 from scenefuse.photos.workspace import View
+from scenefuse.surface.drawings import GEO_KEYS, NOTHING, PIXEL_SCALE, SIDES, TIE_POINT, draw_surface, wall_turn
 from scenefuse.surface.gltf import write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
 from scenefuse.surface.mesh import FaceClass, make_mesh
@@ -192,3 +194,53 @@ def test_a_planted_picture_lands_on_the_faces_that_a_photo_shows_it_on(closed):
     assert right[top & (middle[:, 0] > 0.1)].all()
     # No photo shows the lower half: the colour of the points.
     assert np.allclose(color[middle[:, 2] < -0.5], 100, atol=2)
+
+
+def test_an_elevation_has_the_scale_that_it_says(closed, tmp_path: Path):
+    write_surface(tmp_path / "surface.ply", closed)
+    write_glb(tmp_path / "surface.glb", closed, {})
+    draw_surface(name="ball", surface=tmp_path / "surface.ply", glb=tmp_path / "surface.glb", folder=tmp_path / "d")
+    report = read_json(tmp_path / "d/drawings.json")
+    for side in SIDES:
+        band = Image.open(tmp_path / f"d/{side}_class.tif")
+        pixel = value(report, f"{side}_pixel")
+        assert band.tag_v2[PIXEL_SCALE][:2] == pytest.approx((pixel, pixel))
+        shown = np.asarray(band) != NOTHING
+        assert [n * pixel for n in (shown.any(0).sum(), shown.any(1).sum())] == pytest.approx([2, 2], abs=3 * pixel)
+        assert shown.sum() * pixel**2 == pytest.approx(np.pi, rel=0.01)
+        left, top = band.tag_v2[TIE_POINT][3:5]
+        middle = np.argwhere(shown).mean(0) + 0.5
+        assert [left + middle[1] * pixel, top - middle[0] * pixel] == pytest.approx([0, 0], abs=pixel)
+    assert np.nanmax(np.asarray(Image.open(tmp_path / "d/above_height.tif"))) == pytest.approx(1, abs=0.01)
+    # What photos do not confirm is below.
+    assert (np.asarray(Image.open(tmp_path / "d/above_class.tif")) != FaceClass.UNCONFIRMED).mean() > 0.97
+    assert (tmp_path / "d/drawings.pdf").read_bytes()[:4] == b"%PDF"
+
+
+def test_a_drawing_from_above_lies_in_the_crs_of_its_scene(closed, tmp_path: Path):
+    write_surface(tmp_path / "surface.ply", closed)
+    write_glb(tmp_path / "surface.glb", closed, {})
+    georeference = {
+        "crs": quantity("EPSG:25832", ""),
+        "origin_in_crs": quantity([500100.0, 5200200.0, 300.0], "m"),
+        "length_unit": quantity("m", ""),
+    }
+    write_json(tmp_path / "g.json", georeference)
+    files = {"surface": tmp_path / "surface.ply", "glb": tmp_path / "surface.glb", "folder": tmp_path / "d"}
+    draw_surface(name="ball", georeference_json=tmp_path / "g.json", **files)
+    picture = Image.open(tmp_path / "d/above_height.tif")
+    assert picture.tag_v2[TIE_POINT][3:5] == pytest.approx((500099, 5200201), abs=0.1)
+    assert picture.tag_v2[GEO_KEYS][-1] == 25832
+    assert np.nanmax(np.asarray(picture)) == pytest.approx(301, abs=0.01)
+    assert np.isnan(picture.getpixel((0, 0)))
+
+
+def test_elevations_are_turned_to_the_walls():
+    points, normals = [], []
+    for axis in range(4):
+        turn = Rotation.from_euler("z", 90 * axis + 20, degrees=True).as_matrix()
+        across, up = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 40), np.linspace(0, 1, 20)))
+        points.append(np.column_stack([0 * across + 1, across, up]) @ turn.T)
+        normals.append(np.tile(turn @ [1, 0, 0], (len(across), 1)))
+    surface = make_mesh(with_evidence(np.concatenate(points), np.concatenate(normals)), [])
+    assert np.degrees(wall_turn(surface)) == pytest.approx(20, abs=1)

@@ -1,7 +1,7 @@
 # What is handed over of the completed objects. `scenefuse export` asks for it; `all` does not.
 #
 # INPUTS    results/objects/{object}/fused.ply, fusion.json, undistorted/; results/scenes/{scene}/undistorted/, georeference.json
-# OUTPUTS   results/objects/{object}/surface.ply, surface.glb, surface.json
+# OUTPUTS   results/objects/{object}/surface.ply, surface.glb, surface.json, drawings/
 
 
 rule make_surface:
@@ -35,3 +35,31 @@ rule make_surface:
     shell:
         "exec python {params.script} --fused {input.fused} --fusion-json {input.fusion} {params.photos}"
         " --georeference-json {input.georeference} --surface {output.surface} --glb {output.glb} --report {output.report} &> {log}"
+
+
+rule draw_surface:
+    """A completed object to scale, from above and from four sides, with bands of class and standard deviation (F9)."""
+    input:
+        surface="results/objects/{object}/surface.ply",
+        glb="results/objects/{object}/surface.glb",
+        georeference=in_scene("georeference.json"),
+    output:
+        directory("results/objects/{object}/drawings"),
+    log:
+        "results/logs/draw_surface/{object}.log",
+    benchmark:
+        "results/benchmarks/draw_surface/{object}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    threads: OBJECT_THREADS
+    resources:
+        mem_mb=by_size(3000, surface=20),
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        script=script("surface/draw_surface.py"),
+        code=code("surface/draw_surface.py"),
+    message:
+        "{wildcards.object}: drawings"
+    shell:
+        "exec python {params.script} --name {wildcards.object} --surface {input.surface} --glb {input.glb}"
+        " --georeference-json {input.georeference} --folder {output} &> {log}"

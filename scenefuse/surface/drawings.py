@@ -1,0 +1,242 @@
+"""Drawings of a surface to scale: from above in the CRS, and elevations along the object's own walls (method F9)."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+
+from scenefuse.core.stage import atomic_directory, quantity, read_json, threads, write_json
+from scenefuse.core.transforms import Array
+from scenefuse.fuse.measure import SUPPORT
+from scenefuse.photos.geodesy import length_unit, scene_frame
+from scenefuse.surface.gltf import Painted, metres_per_unit, read_painted
+from scenefuse.surface.make_surface import read_surface
+from scenefuse.surface.mesh import FaceClass, Surface, cast, caster
+from scenefuse.surface.texture import MAX_SIDE_PX
+
+# Normals of walls are nearly level.
+MAX_WALL_SLOPE = 0.3
+# Width and height of a page with its border, metres: A3.
+PAGE, BORDER = (0.42, 0.297), 0.025
+# Value of the class band where nothing is.
+NOTHING = 255
+# Axes of drawings, right and up, by the side that they are seen from; a drawing's third axis points at the viewer.
+SIDES = {
+    "above": ((1, 0, 0), (0, 1, 0)),
+    "south": ((1, 0, 0), (0, 0, 1)),
+    "east": ((0, 1, 0), (0, 0, 1)),
+    "north": ((-1, 0, 0), (0, 0, 1)),
+    "west": ((0, -1, 0), (0, 0, 1)),
+}
+# GeoTIFF tags: pixel scale, tie point, keys; GDAL's tag of the value for nothing.
+PIXEL_SCALE, TIE_POINT, GEO_KEYS, NO_DATA = 33550, 33922, 34735, 42113
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A parallel projection of a surface; the bands are (H, W), the first row at the top.
+
+    Attributes:
+        colors: (H, W, 4) uint8 RGBA.
+        heights: float32, distance towards the viewer along the third axis; NaN where nothing is.
+        classes: uint8 values of FaceClass, NOTHING where nothing is.
+        deviations: float32, NaN where unknown.
+        left, top: of the picture's upper left corner along the drawing's axes.
+        pixel: side of a pixel; all lengths are in the surface's unit.
+    """
+
+    colors: NDArray[np.uint8]
+    heights: NDArray[np.float32]
+    classes: NDArray[np.uint8]
+    deviations: NDArray[np.float32]
+    left: float
+    top: float
+    pixel: float
+
+
+def draw(surface: Surface, painted: Painted | None, axes: Array, pixel: float) -> Drawing:
+    """Draw a surface along the third of some axes.
+
+    Args:
+        surface: what is measured, and how well.
+        painted: the same with a picture; None for the colours of its vertices.
+        axes: (3, 3) unit rows: right, up, towards the viewer.
+        pixel: side of a pixel; larger where a picture would be longer than MAX_SIDE_PX.
+    """
+    points = surface.vertices.points @ axes.T
+    low, high = points.min(0), points.max(0)
+    pixel = max(pixel, float((high - low)[:2].max()) / MAX_SIDE_PX)
+    left, bottom = (np.floor(low[:2] / pixel) - 1) * pixel
+    width, height = np.ceil((high[:2] - [left, bottom]) / pixel).astype(int) + 1
+    top = bottom + height * pixel
+    x, y = np.meshgrid(left + (np.arange(width) + 0.5) * pixel, top - (np.arange(height) + 0.5) * pixel)
+    origins = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, high[2] + pixel)])
+    down = np.tile([0.0, 0, -1], (x.size, 1))
+    hit = cast(caster(points, surface.faces), origins, down)
+    on = np.isfinite(hit["t_hit"])
+    face = hit["primitive_ids"][on].astype(np.int64)
+    corner = surface.faces[face]
+    weights = _weights(hit["primitive_uvs"][on])
+    heights, deviations = np.full(x.size, np.nan, np.float32), np.full(x.size, np.nan, np.float32)
+    classes, colors = np.full(x.size, NOTHING, np.uint8), np.zeros((x.size, 4), np.uint8)
+    heights[on] = origins[on, 2] - hit["t_hit"][on]
+    classes[on] = surface.classes[face]
+    deviations[on] = (surface.vertices.fields["deviation"][corner] * weights).sum(1)
+    colors[on] = 160, 160, 160, 255
+    if surface.vertices.colors is not None:
+        colors[on, :3] = (surface.vertices.colors[corner] * weights[..., None]).sum(1)
+    if painted is not None:
+        found = cast(caster(painted.points @ axes.T, painted.faces), origins, down)
+        of = np.flatnonzero(on & np.isfinite(found["t_hit"]))
+        uv = painted.uv[painted.faces[found["primitive_ids"][of].astype(np.int64)]]
+        at = (uv * _weights(found["primitive_uvs"][of])[..., None]).sum(1) * painted.picture.shape[1::-1] - 0.5
+        for k in range(3):
+            colors[of, k] = map_coordinates(painted.picture[..., k], at[:, ::-1].T, order=1, mode="nearest")
+    bands = (band.reshape(height, width, *band.shape[1:]) for band in (colors, heights, classes, deviations))
+    return Drawing(*bands, float(left), float(top), pixel)
+
+
+def _weights(uvs: NDArray[Any]) -> Array:
+    """(N, 3) of a triangle's corners at places that Embree gives by two of them."""
+    return np.column_stack([1 - uvs.sum(1), uvs])
+
+
+def wall_turn(surface: Surface) -> float:
+    """Angle, radians within 45 degrees, from east or north to the object's walls; 0 where most agree on none."""
+    corners = surface.vertices.points[surface.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    wall = np.abs(normals[:, 2]) <= MAX_WALL_SLOPE * np.linalg.norm(normals, axis=1)
+    flat = normals[wall, 0] + 1j * normals[wall, 1]
+    length = np.abs(flat)
+    mean = (flat**4 / np.maximum(length, 1e-30) ** 3).sum() / max(float(length.sum()), 1e-30)
+    return float(np.angle(mean)) / 4 if abs(mean) >= SUPPORT else 0.0
+
+
+def draw_surface(*, name: str, surface: Path, glb: Path, georeference_json: Path | None = None, folder: Path) -> None:
+    """Draw an object from above and from four sides.
+
+    Of each drawing NAME: NAME.png, a sheet with frame and scale bar, bridged parts hatched; NAME.tif, the picture;
+    NAME_height.tif, NAME_class.tif, NAME_deviation.tif. `above` is a GeoTIFF in the scene's CRS where it has one.
+    Elevations are turned to the object's walls. drawings.pdf has all sheets, A3, to the scale that they say.
+
+    Args:
+        name: of the object.
+        surface: PLY of `make_surface`.
+        glb: the same with a picture from photos, or without.
+        georeference_json: JSON of the scene.
+        folder: output, with drawings.json: pixel, scale, direction of each.
+    """
+    whole, painted = read_surface(surface), read_painted(glb)
+    points = whole.vertices.points
+    unit, metres = length_unit(georeference_json), metres_per_unit(georeference_json)
+    report: dict[str, Any] = {"status": quantity("drawn" if len(whole.faces) else "empty", "")}
+    if painted is not None:
+        painted = replace(painted, points=painted.points / metres)
+    turn = wall_turn(whole) if len(whole.faces) else 0.0
+    frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
+    with atomic_directory(folder) as output:
+        pages = PdfPages(output / "drawings.pdf", metadata={"CreationDate": None})
+        for side, (right, up) in SIDES.items() if len(whole.faces) else ():
+            axes = np.array([right, up, np.cross(right, up)], dtype=np.float64)
+            drawn, shown, crs, shift = whole, painted, None, np.zeros(3)
+            if side != "above":
+                c, s = np.cos(turn), np.sin(turn)
+                axes = axes @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+            elif frame is not None:
+                crs, shift = frame.crs, np.floor(frame.in_crs(np.zeros((1, 3)))[0])
+                drawn = replace(whole, vertices=replace(whole.vertices, points=frame.in_crs(points) - shift))
+                shown = None if painted is None else replace(painted, points=frame.in_crs(painted.points) - shift)
+            drawing = draw(drawn, shown, axes, pixel_of(whole, painted))
+            _write_bands(output / side, drawing, crs, shift)
+            azimuth = (
+                "" if side == "above" else f", looking {np.degrees(np.arctan2(-axes[2, 0], -axes[2, 1])) % 360:.1f}°"
+            )
+            scale = _scale(drawing, metres)
+            title = f"{name} from {'above' if side == 'above' else 'the ' + side}{azimuth}"
+            figure = _sheet(drawing, f"{title}; 1:{scale}" if unit != "scene units" else title, unit, metres / scale)
+            figure.savefig(output / f"{side}.png", dpi=200)
+            pages.savefig(figure)
+            report[f"{side}_pixel"], report[f"{side}_scale"] = quantity(drawing.pixel, unit), quantity(scale, "1")
+        if not len(whole.faces):
+            pages.savefig(Figure(figsize=(1, 1)))
+        pages.close()
+        report |= {"wall_turn": quantity(float(np.degrees(turn)), "deg"), "crs": quantity(frame and frame.crs, "")}
+        write_json(output / "drawings.json", report)
+
+
+def pixel_of(surface: Surface, painted: Painted | None) -> float:
+    """Side of a drawing's pixel: the picture's, which follows the photos; else the distance between vertices."""
+    if painted is None:
+        points = surface.vertices.points
+        return float(np.median(cKDTree(points).query(points, k=2, workers=threads())[0][:, 1]))
+    corners, flat = painted.points[painted.faces], painted.uv[painted.faces] * painted.picture.shape[1::-1]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    a, b = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
+    return float(np.sqrt(area / np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()))
+
+
+def _write_bands(path: Path, drawing: Drawing, crs: str | None, shift: Array) -> None:
+    """PATH.tif and its bands, the places of their pixels in their tags, and the CRS where there is one."""
+    for ending, band, nothing in (
+        ("", drawing.colors, None),
+        ("_height", drawing.heights + np.float32(shift[2]), "nan"),
+        ("_class", drawing.classes, str(NOTHING)),
+        ("_deviation", drawing.deviations, "nan"),
+    ):
+        tags = ImageFileDirectory_v2()
+        tags[PIXEL_SCALE] = (drawing.pixel, drawing.pixel, 0.0)
+        tags[TIE_POINT] = (0.0, 0.0, 0.0, drawing.left + shift[0], drawing.top + shift[1], 0.0)
+        tags.tagtype |= {PIXEL_SCALE: 12, TIE_POINT: 12, GEO_KEYS: 3, NO_DATA: 2}
+        code = None if crs is None else _plane_code(crs)
+        if code:
+            tags[GEO_KEYS] = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, code)
+        if nothing:
+            tags[NO_DATA] = nothing
+        Image.fromarray(band).save(f"{path}{ending}.tif", tiffinfo=tags)
+
+
+def _plane_code(crs: str) -> int | None:
+    """The EPSG code of a CRS without its heights, where it has one and is projected."""
+    known = pyproj.CRS.from_user_input(crs)
+    known = known.sub_crs_list[0] if known.is_compound else known
+    return known.to_epsg() if known.is_projected else None
+
+
+def _scale(drawing: Drawing, metres: float) -> int:
+    """N of the largest scale 1:N, N = 1, 2 or 5 times a power of ten, at which a drawing fits on the page."""
+    height, width = drawing.classes.shape
+    needed = metres * drawing.pixel * max(width / (PAGE[0] - 2 * BORDER), height / (PAGE[1] - 2 * BORDER))
+    power = 10.0 ** np.floor(np.log10(needed))
+    return max(1, round(next(k for k in (1, 2, 5, 10) if k * power >= needed) * power))
+
+
+def _sheet(drawing: Drawing, title: str, unit: str, page_per_unit: float) -> Figure:
+    """A page with a frame, a scale bar and hatched bridges; page_per_unit: metres of the page for a unit."""
+    inch = 0.0254
+    height, width = (side * drawing.pixel for side in drawing.classes.shape)
+    figure = Figure(figsize=(PAGE[0] / inch, PAGE[1] / inch), facecolor="white")
+    size = width * page_per_unit / PAGE[0], height * page_per_unit / PAGE[1]
+    axes = figure.add_axes(((1 - size[0]) / 2, (1 - size[1]) / 2, *size))
+    extent = (drawing.left, drawing.left + width, drawing.top - height, drawing.top)
+    axes.imshow(drawing.colors, extent=extent, interpolation="antialiased")
+    bridged = (drawing.classes == FaceClass.BRIDGED).astype(float)
+    if bridged.any():
+        axes.contourf(bridged, [0.5, 1.5], extent=extent, origin="upper", hatches=["//////"], colors="none")
+    axes.set(xlim=extent[:2], ylim=extent[2:])
+    axes.tick_params(labelsize=7)
+    axes.set_title(title, fontsize=10)
+    bar = 10.0 ** np.floor(np.log10(width / 4))
+    bar *= next(k for k in (5, 2, 1) if k * bar <= width / 2)
+    axes.plot([extent[0] + width / 50, extent[0] + width / 50 + bar], [extent[2] + height / 30] * 2, "k-", linewidth=4)
+    axes.text(extent[0] + width / 50, extent[2] + height / 20, f"{bar:g} {unit}", fontsize=8)
+    figure.text(0.5, BORDER / 2 / PAGE[1], "hatched: interpolated; white: nothing measured", ha="center", fontsize=7)
+    return figure
