@@ -1,6 +1,7 @@
 """Drawings of a surface to scale: from above in the CRS, and elevations along the object's own walls (method F9)."""
 
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,8 @@ from scenefuse.surface.make_surface import read_surface
 from scenefuse.surface.mesh import FaceClass, Surface, cast, caster
 from scenefuse.surface.texture import MAX_SIDE_PX
 
-# Normals of walls are nearly level.
-MAX_WALL_SLOPE = 0.3
-# Width and height of a page with its border, metres: A3.
-PAGE, BORDER = (0.42, 0.297), 0.025
+# Width and height of a page, A3, and of what is drawn on it at most, metres.
+PAGE, DRAWN = np.array([0.42, 0.297]), np.array([0.37, 0.247])
 # Value of the class band where nothing is.
 NOTHING = 255
 # Axes of drawings, right and up, by the side that they are seen from; a drawing's third axis points at the viewer.
@@ -37,8 +36,15 @@ SIDES = {
     "north": ((-1, 0, 0), (0, 0, 1)),
     "west": ((0, -1, 0), (0, 0, 1)),
 }
-# GeoTIFF tags: pixel scale, tie point, keys; GDAL's tag of the value for nothing.
-PIXEL_SCALE, TIE_POINT, GEO_KEYS, NO_DATA = 33550, 33922, 34735, 42113
+
+
+class Tag(IntEnum):
+    """GeoTIFF's tags, and GDAL's for the value of nothing."""
+
+    PIXEL_SCALE = 33550
+    TIE_POINT = 33922
+    GEO_KEYS = 34735
+    NO_DATA = 42113
 
 
 @dataclass(frozen=True)
@@ -101,8 +107,9 @@ def draw(surface: Surface, painted: Painted | None, axes: Array, pixel: float) -
         at = (uv * _weights(found["primitive_uvs"][of])[..., None]).sum(1) * painted.picture.shape[1::-1] - 0.5
         for k in range(3):
             colors[of, k] = map_coordinates(painted.picture[..., k], at[:, ::-1].T, order=1, mode="nearest")
-    bands = (band.reshape(height, width, *band.shape[1:]) for band in (colors, heights, classes, deviations))
-    return Drawing(*bands, float(left), float(top), pixel)
+    shape = (height, width)
+    flat = (heights.reshape(shape), classes.reshape(shape), deviations.reshape(shape))
+    return Drawing(colors.reshape(*shape, 4), *flat, float(left), float(top), pixel)
 
 
 def _weights(uvs: NDArray[Any]) -> Array:
@@ -114,8 +121,8 @@ def wall_turn(surface: Surface) -> float:
     """Angle, radians within 45 degrees, from east or north to the object's walls; 0 where most agree on none."""
     corners = surface.vertices.points[surface.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    wall = np.abs(normals[:, 2]) <= MAX_WALL_SLOPE * np.linalg.norm(normals, axis=1)
-    flat = normals[wall, 0] + 1j * normals[wall, 1]
+    # The level part of a normal, weighted by the area that it has seen from the side.
+    flat = normals[:, 0] + 1j * normals[:, 1]
     length = np.abs(flat)
     mean = (flat**4 / np.maximum(length, 1e-30) ** 3).sum() / max(float(length.sum()), 1e-30)
     return float(np.angle(mean)) / 4 if abs(mean) >= SUPPORT else 0.0
@@ -136,7 +143,6 @@ def draw_surface(*, name: str, surface: Path, glb: Path, georeference_json: Path
         folder: output, with drawings.json: pixel, scale, direction of each.
     """
     whole, painted = read_surface(surface), read_painted(glb)
-    points = whole.vertices.points
     unit, metres = length_unit(georeference_json), metres_per_unit(georeference_json)
     report: dict[str, Any] = {"status": quantity("drawn" if len(whole.faces) else "empty", "")}
     if painted is not None:
@@ -153,7 +159,8 @@ def draw_surface(*, name: str, surface: Path, glb: Path, georeference_json: Path
                 axes = axes @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
             elif frame is not None:
                 crs, shift = frame.crs, np.floor(frame.in_crs(np.zeros((1, 3)))[0])
-                drawn = replace(whole, vertices=replace(whole.vertices, points=frame.in_crs(points) - shift))
+                vertices = whole.vertices
+                drawn = replace(whole, vertices=replace(vertices, points=frame.in_crs(vertices.points) - shift))
                 shown = None if painted is None else replace(painted, points=frame.in_crs(painted.points) - shift)
             drawing = draw(drawn, shown, axes, pixel_of(whole, painted))
             _write_bands(output / side, drawing, crs, shift)
@@ -193,14 +200,14 @@ def _write_bands(path: Path, drawing: Drawing, crs: str | None, shift: Array) ->
         ("_deviation", drawing.deviations, "nan"),
     ):
         tags = ImageFileDirectory_v2()
-        tags[PIXEL_SCALE] = (drawing.pixel, drawing.pixel, 0.0)
-        tags[TIE_POINT] = (0.0, 0.0, 0.0, drawing.left + shift[0], drawing.top + shift[1], 0.0)
-        tags.tagtype |= {PIXEL_SCALE: 12, TIE_POINT: 12, GEO_KEYS: 3, NO_DATA: 2}
+        tags[Tag.PIXEL_SCALE] = (drawing.pixel, drawing.pixel, 0.0)
+        tags[Tag.TIE_POINT] = (0.0, 0.0, 0.0, drawing.left + shift[0], drawing.top + shift[1], 0.0)
+        tags.tagtype |= {Tag.PIXEL_SCALE: 12, Tag.TIE_POINT: 12, Tag.GEO_KEYS: 3, Tag.NO_DATA: 2}
         code = None if crs is None else _plane_code(crs)
         if code:
-            tags[GEO_KEYS] = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, code)
+            tags[Tag.GEO_KEYS] = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, code)
         if nothing:
-            tags[NO_DATA] = nothing
+            tags[Tag.NO_DATA] = nothing
         Image.fromarray(band).save(f"{path}{ending}.tif", tiffinfo=tags)
 
 
@@ -214,7 +221,7 @@ def _plane_code(crs: str) -> int | None:
 def _scale(drawing: Drawing, metres: float) -> int:
     """N of the largest scale 1:N, N = 1, 2 or 5 times a power of ten, at which a drawing fits on the page."""
     height, width = drawing.classes.shape
-    needed = metres * drawing.pixel * max(width / (PAGE[0] - 2 * BORDER), height / (PAGE[1] - 2 * BORDER))
+    needed = metres * drawing.pixel * max(width / DRAWN[0], height / DRAWN[1])
     power = 10.0 ** np.floor(np.log10(needed))
     return max(1, round(next(k for k in (1, 2, 5, 10) if k * power >= needed) * power))
 
@@ -238,5 +245,5 @@ def _sheet(drawing: Drawing, title: str, unit: str, page_per_unit: float) -> Fig
     bar *= next(k for k in (5, 2, 1) if k * bar <= width / 2)
     axes.plot([extent[0] + width / 50, extent[0] + width / 50 + bar], [extent[2] + height / 30] * 2, "k-", linewidth=4)
     axes.text(extent[0] + width / 50, extent[2] + height / 20, f"{bar:g} {unit}", fontsize=8)
-    figure.text(0.5, BORDER / 2 / PAGE[1], "hatched: interpolated; white: nothing measured", ha="center", fontsize=7)
+    figure.text(0.5, 0.04, "hatched: interpolated; white: nothing measured", ha="center", fontsize=7)
     return figure

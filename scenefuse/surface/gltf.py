@@ -7,6 +7,7 @@ import io
 import json
 import struct
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,16 @@ from scenefuse.surface.mesh import FaceClass, Surface
 Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 # What nobody measured is drawn in one colour (linear RGBA), which photos of objects hardly hold.
 BRIDGED_TINT = (0.6, 0.1, 0.5, 1.0)
-# glTF's codes of component types, and those of buffers.
-FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
-VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
+
+
+class _Code(IntEnum):
+    """glTF's codes of component types and of buffers."""
+
+    FLOAT = 5126
+    UNSIGNED_SHORT = 5123
+    UNSIGNED_INT = 5125
+    VERTEX_BUFFER = 34962
+    INDEX_BUFFER = 34963
 
 
 class _Buffer:
@@ -51,7 +59,7 @@ class _Buffer:
 
     def accessor(self, values: NDArray[Any], kind: str, component: int, **more: Any) -> int:
         """An accessor of rows of values, by its number."""
-        target = INDEX_BUFFER if component == UNSIGNED_INT else VERTEX_BUFFER
+        target = _Code.INDEX_BUFFER if component == _Code.UNSIGNED_INT else _Code.VERTEX_BUFFER
         view = self.add(np.ascontiguousarray(values).tobytes(), target)
         entry = {"bufferView": view, "componentType": component, "count": len(values), "type": kind, **more}
         self.accessors.append(entry)
@@ -147,13 +155,14 @@ def read_painted(path: Path) -> Painted | None:
         names = primitive["attributes"]
         if "TEXCOORD_0" in names:
             numbers = (names["POSITION"], primitive["indices"], names["TEXCOORD_0"])
-            points, faces, uv = (view(content["accessors"][number]["bufferView"]) for number in numbers)
-            positions = np.frombuffer(points, "<f4").reshape(-1, 3) @ Y_UP_FROM_Z_UP
-            triangles = np.frombuffer(faces, "<u4").astype(np.int64).reshape(-1, 3) + count
-            parts.append((positions, triangles, np.frombuffer(uv, "<f4").reshape(-1, 2).astype(np.float64)))
+            at, corners, flat = (view(content["accessors"][number]["bufferView"]) for number in numbers)
+            positions = np.frombuffer(at, "<f4").reshape(-1, 3) @ Y_UP_FROM_Z_UP
+            triangles = np.frombuffer(corners, "<u4").astype(np.int64).reshape(-1, 3) + count
+            parts.append((positions, triangles, np.frombuffer(flat, "<f4").reshape(-1, 2).astype(np.float64)))
             count += len(positions)
     picture = np.asarray(Image.open(io.BytesIO(view(content["images"][0]["bufferView"]))).convert("RGB"))
-    return Painted(*(np.concatenate(part) for part in zip(*parts)), picture)
+    points, faces, uv = (np.concatenate(part) for part in zip(*parts))
+    return Painted(points, faces, uv, picture)
 
 
 def _primitive(buffer: _Buffer, part: Surface, kind: FaceClass, metres: float, uv: Array | None) -> dict[str, Any]:
@@ -169,21 +178,21 @@ def _primitive(buffer: _Buffer, part: Surface, kind: FaceClass, metres: float, u
     normals = np.where(length > 0, vertices.normals / np.maximum(length, 1e-12), [0, 0, 1]) @ Y_UP_FROM_Z_UP.T
     bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
     attributes = {
-        "POSITION": buffer.accessor(positions, "VEC3", FLOAT, **bounds),
-        "NORMAL": buffer.accessor(normals.astype(np.float32), "VEC3", FLOAT),
-        "_FEATURE_ID_0": buffer.accessor(np.full(len(positions), kind, np.float32), "SCALAR", FLOAT),
+        "POSITION": buffer.accessor(positions, "VEC3", _Code.FLOAT, **bounds),
+        "NORMAL": buffer.accessor(normals.astype(np.float32), "VEC3", _Code.FLOAT),
+        "_FEATURE_ID_0": buffer.accessor(np.full(len(positions), kind, np.float32), "SCALAR", _Code.FLOAT),
     }
     if uv is not None:
-        attributes["TEXCOORD_0"] = buffer.accessor(places.astype(np.float32), "VEC2", FLOAT)
+        attributes["TEXCOORD_0"] = buffer.accessor(places.astype(np.float32), "VEC2", _Code.FLOAT)
     elif vertices.colors is not None and kind != FaceClass.BRIDGED:
         linear = np.where(
             vertices.colors <= 10, vertices.colors / 3294.6, ((vertices.colors / 255 + 0.055) / 1.055) ** 2.4
         )
         rgba = np.column_stack([np.rint(65535 * linear), np.full(len(linear), 65535)]).astype(np.uint16)
-        attributes["COLOR_0"] = buffer.accessor(rgba, "VEC4", UNSIGNED_SHORT, normalized=True)
+        attributes["COLOR_0"] = buffer.accessor(rgba, "VEC4", _Code.UNSIGNED_SHORT, normalized=True)
     return {
         "attributes": attributes,
-        "indices": buffer.accessor(faces.astype(np.uint32).ravel(), "SCALAR", UNSIGNED_INT),
+        "indices": buffer.accessor(faces.astype(np.uint32).ravel(), "SCALAR", _Code.UNSIGNED_INT),
         "material": int(kind == FaceClass.BRIDGED),
         "extensions": {
             "EXT_mesh_features": {"featureIds": [{"featureCount": len(FaceClass), "attribute": 0, "label": "class"}]}

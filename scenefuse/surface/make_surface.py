@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, records_of, sampled
-from scenefuse.cloud.readers.columns import COLOR, NORMAL, POSITION
+from scenefuse.cloud.clouds import Cloud, cloud_of, read_cloud, records_of
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Sim3
@@ -20,9 +19,6 @@ from scenefuse.photos.workspace import View, Workspace, read_views
 from scenefuse.surface.gltf import metres_per_unit, place_of_scene, write_glb
 from scenefuse.surface.mesh import FaceClass, Surface, make_mesh
 from scenefuse.surface.texture import Textured, textured
-
-# Places of a surface at which it is counted which photos show it.
-PHOTO_SAMPLE = 2000
 
 
 @dataclass(frozen=True)
@@ -83,7 +79,7 @@ def paint(surface: Surface, views: list[tuple[Path, View]]) -> tuple[Textured | 
         surface: in the scene's frame.
         views: cameras there, each with its workspace.
     """
-    sample = sampled(surface.vertices.points, PHOTO_SAMPLE, seed=0)
+    sample = surface.vertices.points[:: max(1, len(surface.vertices) // 2000)]
     shown = np.zeros((len(views), len(sample)), dtype=bool)
     for row, (_, view) in zip(shown, views):
         row[view.visible(sample)[0]] = True
@@ -120,7 +116,11 @@ def placed_views(inputs: SurfaceInputs) -> list[tuple[Path, View]]:
 
 def _nothing() -> Surface:
     """A surface without faces."""
-    fields = {"evidence": np.zeros(0, np.uint8), "deviation": np.zeros(0, np.float32), "class": np.zeros(0, np.uint8)}
+    fields: dict[str, NDArray[Any]] = {
+        "evidence": np.zeros(0, np.uint8),
+        "deviation": np.zeros(0, np.float32),
+        "class": np.zeros(0, np.uint8),
+    }
     vertices = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), None, fields)
     return Surface(vertices, np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), 0.0)
 
@@ -162,11 +162,4 @@ def read_surface(path: Path) -> Surface:
         indices = np.asarray(faces["vertex_indices"].tolist(), np.int64).reshape(-1, 3)
     except Exception as error:
         raise StageError(f"{path} is no surface ({error}); make it again with scenefuse export") from None
-    xyz, normals, rgb = ([columns.pop(name, None) for name in names] for names in (POSITION, NORMAL, COLOR))
-    vertices = Cloud(
-        np.stack(xyz, axis=1),
-        np.stack(normals, axis=1),
-        None if rgb[0] is None else np.stack(rgb, axis=1),
-        columns,
-    )
-    return Surface(vertices, indices, np.asarray(faces["class"]), 0.0)
+    return Surface(cloud_of(columns), indices, np.asarray(faces["class"]), 0.0)

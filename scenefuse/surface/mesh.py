@@ -25,8 +25,6 @@ Mask = NDArray[np.bool_]
 
 # Points that a surface is made from at most: memory and time grow with them.
 MAX_POINTS = 1_000_000
-# Levels of the octree at most: finer than the surface of so many points.
-MAX_DEPTH = 11
 # Widest gap that is bridged, as a share of the diagonal: where a surface bends by a right angle in the middle of a gap,
 # it passes at half the width from what closes it, which is 1 % at most.
 MAX_GAP = 2 * MARGIN
@@ -147,6 +145,7 @@ def oriented(cloud: Cloud, views: list[View]) -> Cloud:
 def _open3d_cloud(cloud: Cloud, middle: Array):  # type: ignore[no-untyped-def]
     import open3d as o3d
 
+    assert cloud.normals is not None
     points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points - middle))
     points.normals = o3d.utility.Vector3dVector(cloud.normals.astype(np.float64))
     return points
@@ -158,7 +157,9 @@ def _poisson(cloud: Cloud, step: float) -> tuple[Array, Rows, NDArray[np.float32
 
     middle = cloud.points.mean(0)
     side = BEYOND_BOX * float(np.ptp(cloud.points, axis=0).max())
-    depth = int(np.clip(np.ceil(np.log2(side / step)), 1, MAX_DEPTH))
+    # A surface of MAX_POINTS has no more levels.
+    most = np.ceil(np.log2(MAX_POINTS) / 2) + 1
+    depth = int(np.clip(np.ceil(np.log2(side / step)), 1, most))
     mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
         _open3d_cloud(cloud, middle), depth=depth, scale=BEYOND_BOX, n_threads=threads()
     )
@@ -224,7 +225,8 @@ def caster(points: Array, faces: Rows):  # type: ignore[no-untyped-def]
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene(threads())
-    scene.add_triangles(points.astype(np.float32), faces.astype(np.uint32))
+    tensor = o3d.core.Tensor.from_numpy
+    scene.add_triangles(tensor(points.astype(np.float32)), tensor(faces.astype(np.uint32)))
     return scene
 
 
@@ -256,7 +258,7 @@ def _neighbours(faces: Rows) -> tuple[Rows, Mask]:
     pairs = np.stack([order[:-1][same], order[1:][same]], axis=1) // 3
     shared = np.zeros(len(key), dtype=bool)
     shared[order[1:][same]] = shared[order[:-1][same]] = True
-    return pairs, ~shared.reshape(-1, 3).all(1)
+    return pairs, np.asarray(~shared.reshape(-1, 3).all(1))
 
 
 def _areas(points: Array, faces: Rows) -> Array:

@@ -27,8 +27,6 @@ from scenefuse.surface.mesh import FaceClass, Rows, Surface, cast, caster
 TEXTURED_FACES = 40_000
 # Longest side of the picture, that all graphics cards take.
 MAX_SIDE_PX = 8192
-# Share of the picture that unfolded pieces cover, about.
-COVERED_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,8 @@ def textured(surface: Surface, photos: list[View], read: Callable[[int], NDArray
         return None
     points, faces = small.vertices.points, small.faces[painted]
     pixels = _footprints(small, photos).max(0)[painted]
-    wanted = small.areas()[painted].sum() * np.median(pixels[pixels > 0]) / COVERED_SHARE
+    # Unfolded pieces cover about half of a picture.
+    wanted = 2 * small.areas()[painted].sum() * np.median(pixels[pixels > 0])
     side = int(np.clip(np.sqrt(wanted), 64, MAX_SIDE_PX))
     uv = _unfolded(points, faces, side)
     face, places = _texels(points, faces, uv, side)
@@ -170,7 +169,8 @@ def _unfolded(points: Array, faces: Rows, side: int) -> Array:
     """(F, 3, 2) places of the faces' corners in a picture of a side, from its upper left, 0..1."""
     import open3d as o3d
 
-    mesh = o3d.t.geometry.TriangleMesh((points - points.mean(0)).astype(np.float32), faces)
+    tensor = o3d.core.Tensor.from_numpy
+    mesh = o3d.t.geometry.TriangleMesh(tensor((points - points.mean(0)).astype(np.float32)), tensor(faces))
     mesh.compute_uvatlas(size=side, parallel_partitions=threads(), nthreads=threads())
     uv = mesh.triangle.texture_uvs.numpy().astype(np.float64)
     return np.stack([uv[..., 0], 1 - uv[..., 1]], axis=-1)

@@ -15,7 +15,7 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.core.transforms import look_at
 from scenefuse.fuse.measure import Evidence
 from scenefuse.photos.workspace import View
-from scenefuse.surface.drawings import GEO_KEYS, NOTHING, PIXEL_SCALE, SIDES, TIE_POINT, draw_surface, wall_turn
+from scenefuse.surface.drawings import NOTHING, SIDES, Tag, draw_surface, wall_turn
 from scenefuse.surface.gltf import write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
 from scenefuse.surface.mesh import FaceClass, make_mesh
@@ -204,11 +204,11 @@ def test_an_elevation_has_the_scale_that_it_says(closed, tmp_path: Path):
     for side in SIDES:
         band = Image.open(tmp_path / f"d/{side}_class.tif")
         pixel = value(report, f"{side}_pixel")
-        assert band.tag_v2[PIXEL_SCALE][:2] == pytest.approx((pixel, pixel))
+        assert band.tag_v2[Tag.PIXEL_SCALE][:2] == pytest.approx((pixel, pixel))
         shown = np.asarray(band) != NOTHING
         assert [n * pixel for n in (shown.any(0).sum(), shown.any(1).sum())] == pytest.approx([2, 2], abs=3 * pixel)
         assert shown.sum() * pixel**2 == pytest.approx(np.pi, rel=0.01)
-        left, top = band.tag_v2[TIE_POINT][3:5]
+        left, top = band.tag_v2[Tag.TIE_POINT][3:5]
         middle = np.argwhere(shown).mean(0) + 0.5
         assert [left + middle[1] * pixel, top - middle[0] * pixel] == pytest.approx([0, 0], abs=pixel)
     assert np.nanmax(np.asarray(Image.open(tmp_path / "d/above_height.tif"))) == pytest.approx(1, abs=0.01)
@@ -229,8 +229,8 @@ def test_a_drawing_from_above_lies_in_the_crs_of_its_scene(closed, tmp_path: Pat
     files = {"surface": tmp_path / "surface.ply", "glb": tmp_path / "surface.glb", "folder": tmp_path / "d"}
     draw_surface(name="ball", georeference_json=tmp_path / "g.json", **files)
     picture = Image.open(tmp_path / "d/above_height.tif")
-    assert picture.tag_v2[TIE_POINT][3:5] == pytest.approx((500099, 5200201), abs=0.1)
-    assert picture.tag_v2[GEO_KEYS][-1] == 25832
+    assert picture.tag_v2[Tag.TIE_POINT][3:5] == pytest.approx((500099, 5200201), abs=0.1)
+    assert picture.tag_v2[Tag.GEO_KEYS][-1] == 25832
     assert np.nanmax(np.asarray(picture)) == pytest.approx(301, abs=0.01)
     assert np.isnan(picture.getpixel((0, 0)))
 
