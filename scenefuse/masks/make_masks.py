@@ -1,5 +1,6 @@
 """Masks of the object in every photo: by GrabCut or SAM 2 from prompts, or supplied; checked by their visual hull."""
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from scenefuse.core.stage import (
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.clicks import read_points
 from scenefuse.masks.algebra import kept_part, mask_folders
+from scenefuse.masks.prompts import overlap
 from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.sam2_weights import why_unavailable
 from scenefuse.masks.segmentation import MaskSettings, Prompted, ScoredMasks, masks_from_prompts, score_masks
@@ -128,10 +130,18 @@ def _make(
             )
         marked, sizes = read_points(inputs.prompts), original_sizes(read_json(inputs.photos_json))
         network, by = _network(settings)
-        found = masks_from_prompts(marked, inputs.sparse, sizes, photos, up, network, settings, seed)
+        given = marked, inputs.sparse, sizes, photos, up, network, settings, seed
+        found = masks_from_prompts(*given)
+    scored = score_masks(found.masks, found.target, photos.views, settings, found.clicked)
+    if _least_clicked(scored, found) < settings.min_agreement:
+        print("the propagated masks contradict the clicks: once more, with fewer points outside allowed", flush=True)
+        with suppress(StageError):
+            strict = masks_from_prompts(*given, overlap)
+            again = score_masks(strict.masks, strict.target, photos.views, settings, strict.clicked)
+            if _least_clicked(again, strict) > _least_clicked(scored, found):
+                scored, found = again, strict
     own = found.target.kind
     print(f"{np.sum(own > 0)} points on the object, {np.sum(own < 0)} not", flush=True)
-    scored = score_masks(found.masks, found.target, photos.views, settings, found.clicked)
     for name in set(scored.dropped) & set(found.reasons):
         scored.dropped[name] += f"; {found.reasons[name]}"
     against = sorted(name for name in found.clicked if scored.scores[name] < settings.min_agreement)
@@ -143,6 +153,11 @@ def _make(
         found = replace(found, notes=(*found.notes, note))
     made = _kept(scored, settings.keep, inputs.sparse, photos.views)
     return replace(made, dropped=unusable | made.dropped), found, by
+
+
+def _least_clicked(scored: ScoredMasks, found: Prompted) -> float:
+    """Least IoU with the hull's outline of the masks that come from clicks in their own photo; 1 without any."""
+    return min((scored.scores[name] for name in found.clicked), default=1.0)
 
 
 def _with_disputed(made: ScoredMasks, found: Prompted, min_photos: int) -> tuple[ScoredMasks, Prompted]:

@@ -48,6 +48,8 @@ class Prompts(NamedTuple):
         return np.concatenate([self.clicked_off, self.known_off])
 
 
+Measure = Callable[[Mask, Prompts, float], float]
+"""How well a mask (H, W) agrees with prompts, clicks within a tolerance in pixels; at most 1."""
 Segmenter = Callable[[View, Prompts, Array | None], tuple[list[Mask], Array]]
 """Masks (H, W) of a photo with RGB pixels and their qualities, 0..1, from prompts and perhaps a box (2, 2)."""
 
@@ -55,9 +57,23 @@ Segmenter = Callable[[View, Prompts, Array | None], tuple[list[Mask], Array]]
 def agreement(mask: Mask, prompts: Prompts, tolerance_px: float) -> float:
     """Share of the pixels inside that a mask (H, W) holds, less the share of those outside that it holds; 1 where none
     is known. A click is held when it is no farther off than the tolerance."""
-    inside = np.concatenate([held(mask, prompts.clicked, tolerance_px), held(mask, prompts.known, 0)])
-    spared = np.concatenate([held(~mask, prompts.clicked_off, tolerance_px), held(~mask, prompts.known_off, 0)])
+    inside, spared = _sides(mask, prompts, tolerance_px)
     return float((inside.mean() if len(inside) else 1.0) - ((~spared).mean() if len(spared) else 0.0))
+
+
+def overlap(mask: Mask, prompts: Prompts, tolerance_px: float) -> float:
+    """As `agreement`, but the IoU of the mask with the pixels inside: what is around a small object is few of a photo's
+    pixels outside, and more than its own."""
+    inside, spared = _sides(mask, prompts, tolerance_px)
+    if not len(inside):
+        return float(spared.mean()) if len(spared) else 1.0
+    return float(inside.sum() / (len(inside) + (~spared).sum()))
+
+
+def _sides(mask: Mask, prompts: Prompts, tolerance_px: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(N,) which pixels inside a mask holds, and (M,) which outside it does not."""
+    inside = np.concatenate([held(mask, prompts.clicked, tolerance_px), held(mask, prompts.known, 0)])
+    return inside, np.concatenate([held(~mask, prompts.clicked_off, tolerance_px), held(~mask, prompts.known_off, 0)])
 
 
 def held(mask: Mask, pixels: Array, tolerance_px: float) -> NDArray[np.bool_]:

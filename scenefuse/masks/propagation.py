@@ -15,6 +15,7 @@ from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks
 from scenefuse.masks.grabcut import cleaned
 from scenefuse.masks.prompts import (
     OUTLINE_BAND_SHARE,
+    Measure,
     Prompts,
     Segmenter,
     agreement,
@@ -69,7 +70,11 @@ class Propagated:
 
 
 def propagate(
-    segment: Segmenter, photos: Workspace, clicked: dict[int, PhotoClicks], tolerance_px: float
+    segment: Segmenter,
+    photos: Workspace,
+    clicked: dict[int, PhotoClicks],
+    tolerance_px: float,
+    measure: Measure = agreement,
 ) -> Propagated:
     """Masks of all photos from clicks in one or more of them (method K1).
 
@@ -93,7 +98,7 @@ def propagate(
 
     def make(k: int, note: str = "") -> None:
         others = {row: voter for row, voter in made.items() if row != k}
-        made[k], left_out[k] = _make(segment, photos, k, clicked.get(k, NO_CLICKS), others, tolerance_px)
+        made[k], left_out[k] = _make(segment, photos, k, clicked.get(k, NO_CLICKS), others, tolerance_px, measure)
         name, voter = photos.views[k].name, made[k]
         print(f"{name}{note}: quality {voter.quality:.2f}, agreement {voter.agreement:.2f}", flush=True)
 
@@ -114,7 +119,7 @@ def propagate(
         make_all()
     for k in range(len(photos.views)):
         others = {row: voter for row, voter in made.items() if row != k}
-        settled = k in made and made[k].votes and agrees_with_others(photos, k, made[k].mask, others)
+        settled = k in made and made[k].votes and agrees_with_others(photos, k, made[k].mask, others, measure)
         if not settled and not (k in made and made[k].final):
             make(k, " again")
     for k, voter in made.items():
@@ -170,6 +175,7 @@ def _make(
     clicks: PhotoClicks,
     others: dict[int, Voter],
     tolerance_px: float,
+    measure: Measure = agreement,
 ) -> tuple[Voter, list[str]]:
     """A photo's mask from its clicks and the others' votes; and the clicks left out as they contradict it."""
     known = known_pixels(photos, k, others)
@@ -181,7 +187,7 @@ def _make(
         if len(known.known) < MIN_KNOWN_POINTS and not kept.prompt:
             break
         prompts = known._replace(clicked=kept.on, clicked_off=np.concatenate([kept.off, known.clicked_off]))
-        voter = voter_of(photos, k, *best_mask(segment, view, prompts, clicks.box, tolerance_px), kept)
+        voter = voter_of(photos, k, *best_mask(segment, view, prompts, clicks.box, tolerance_px, measure), kept)
         wrong = keep & ~_held_clicks(voter.mask, clicks, tolerance_px)
         if not wrong.any():
             break
@@ -201,7 +207,12 @@ def _held_clicks(mask: Mask, clicks: PhotoClicks, tolerance_px: float) -> NDArra
 
 
 def best_mask(
-    segment: Segmenter, view: View, prompts: Prompts, box: Array | None, tolerance_px: float
+    segment: Segmenter,
+    view: View,
+    prompts: Prompts,
+    box: Array | None,
+    tolerance_px: float,
+    measure: Measure = agreement,
 ) -> tuple[Mask, float, float]:
     """The best of the masks for prompts, without the parts of it that hold none, with clicked parts that prompt alone.
 
@@ -214,6 +225,7 @@ def best_mask(
         prompts: its own clicks, and what is known from other photos' masks.
         box: (2, 2) corners of a box that was drawn, or None.
         tolerance_px: a click this far on the wrong side of a mask's outline is no contradiction.
+        measure: of a mask's agreement with its prompts.
 
     Returns:
         The mask (H, W); its quality by the segmenter's own estimate, 0 where it is empty; its agreement.
@@ -224,7 +236,7 @@ def best_mask(
     for mask, quality in zip(*segment(view, prompts, box)):
         mask = prompted_parts(cleaned(mask, view.pixels), prompts.inside, prompts.outside)
         if mask.any():
-            score = agreement(mask, prompts, tolerance_px) + QUALITY_WEIGHT * float(quality)
+            score = measure(mask, prompts, tolerance_px) + QUALITY_WEIGHT * float(quality)
             found.append(((agreement(mask, clicks, tolerance_px), score), mask, float(quality)))
     if not found:
         return np.zeros((view.height, view.width), dtype=bool), 0.0, 0.0
@@ -233,7 +245,7 @@ def best_mask(
         alike = [one for one in found if one[0][0] == rank[0] and one[0][1] > rank[1] - SCORE_MARGIN]
         _, best, quality = max(alike, key=lambda one: one[1].sum())
     mask = _with_clicked_parts(segment, view, best, prompts, reach_px)
-    return mask, quality, agreement(mask, prompts, tolerance_px)
+    return mask, quality, measure(mask, prompts, tolerance_px)
 
 
 def _with_clicked_parts(segment: Segmenter, view: View, mask: Mask, prompts: Prompts, reach_px: float) -> Mask:

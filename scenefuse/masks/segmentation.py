@@ -16,7 +16,7 @@ from scenefuse.marks.clicks import Clicks, ScenePoints
 from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks, clicks_per_photo
 from scenefuse.marks.triangulation import marked_size, triangulate_consistent
 from scenefuse.masks.grabcut import along_edges, cleaned, first_cuts, query_grabcut, second_cuts
-from scenefuse.masks.prompts import BOX_GROWTH_SHARE, Segmenter
+from scenefuse.masks.prompts import BOX_GROWTH_SHARE, Measure, Segmenter, agreement
 from scenefuse.masks.propagation import propagate
 from scenefuse.masks.sam2 import LOGITS_PX, SIDE_PX, Sam2, query_sam2, segment
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
@@ -217,6 +217,7 @@ def masks_from_prompts(
     network: Sam2 | None,
     settings: MaskSettings,
     seed: int,
+    measure: Measure = agreement,
 ) -> Prompted:
     """Masks of all photos by SAM 2, or by GrabCut where there is no network.
 
@@ -229,6 +230,7 @@ def masks_from_prompts(
         network: SAM 2, or None.
         settings: see MaskSettings.
         seed: seed of the ground's RANSAC.
+        measure: of a propagated mask's agreement with its prompts.
 
     Raises:
         StageError: the prompts are wrong or too few, or lead to no mask.
@@ -238,7 +240,7 @@ def masks_from_prompts(
         cut: Segmenter = partial(query_grabcut, settings.grabcut_width_px)
         segment = partial(query_sam2, network) if network else cut
         photos = with_stereo_points(photos) if network else photos
-        found = propagate(segment, photos, own, settings.max_click_residual_px)
+        found = propagate(segment, photos, own, settings.max_click_residual_px, measure)
         target = target_from_votes(found.kind, photos, up, seed)
         if network:
             masks = segment_again(network, target, found.masks, photos, settings, found.clicked)

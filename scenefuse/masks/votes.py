@@ -11,7 +11,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.photo_clicks import PhotoClicks
-from scenefuse.masks.prompts import POINT_RADIUS_SHARE, Prompts, agreement, distance_to, pixel_of
+from scenefuse.masks.prompts import POINT_RADIUS_SHARE, Measure, Prompts, distance_to, pixel_of
 from scenefuse.masks.target import MIN_OBJECT_POINTS, in_hull, without_outermost
 from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.photos.workspace import Workspace
@@ -125,9 +125,9 @@ def known_pixels(photos: Workspace, k: int, others: dict[int, Voter]) -> Prompts
     return Prompts(clicked_off=clicked_off, known=at[kind > 0], known_off=at[kind < 0])
 
 
-def agrees_with_others(photos: Workspace, k: int, mask: Mask, others: dict[int, Voter]) -> bool:
+def agrees_with_others(photos: Workspace, k: int, mask: Mask, others: dict[int, Voter], measure: Measure) -> bool:
     """Whether a mask (H, W) agrees with the votes of the others; so it does where these know nothing of its photo."""
-    return agreement(mask, known_pixels(photos, k, others), 0) >= MIN_AGREEMENT
+    return measure(mask, known_pixels(photos, k, others), 0) >= MIN_AGREEMENT
 
 
 def points_in_masks(photos: Workspace, masks: list[Mask]) -> Array:

@@ -11,8 +11,8 @@ from support.planted_ball import HEIGHT, MIDDLE, PHOTOS, WIDTH, BallNetwork, cli
 from scenefuse.core.stage import StageError
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.masks.grabcut import along_edges, grow_seeds, query_grabcut
-from scenefuse.masks.prompts import NO_PIXELS, Prompts, far_apart
-from scenefuse.masks.propagation import NO_CLICKS, one_photo, propagate
+from scenefuse.masks.prompts import NO_PIXELS, Prompts, far_apart, overlap
+from scenefuse.masks.propagation import NO_CLICKS, best_mask, one_photo, propagate
 from scenefuse.masks.sam2 import query_sam2
 from scenefuse.masks.segmentation import (
     MaskSettings,
@@ -91,6 +91,23 @@ def test_parts_without_a_prompt_are_not_the_object(photos):
 
     carried = propagate(segment, photos, {0: clicks([MIDDLE])}, 2)
     assert all(mask_iou(m, true_mask(v)) == 1 for m, v in zip(carried.masks, photos.views))
+
+
+def test_by_overlap_a_part_of_a_house_beats_the_house_around_it(photos):
+    view = photos.views[0]
+    part = hat(view)
+    house = true_mask(view) | part
+    house[15:45, 60:100] = True
+    on, off = np.argwhere(part)[::5, ::-1] + 0.5, np.argwhere(true_mask(view))[::200, ::-1] + 0.5
+    ground = np.argwhere(np.arange(HEIGHT)[:, None] > np.full(WIDTH, 72))[::4, ::-1] + 0.5
+    known = Prompts(known=on, known_off=np.concatenate([off, ground]))
+
+    def segment(view, prompts, box):
+        return [part, house], np.array([0.5, 0.9])
+
+    large, _, _ = best_mask(segment, view, known, None, 0)
+    small, _, _ = best_mask(segment, view, known, None, 0, overlap)
+    assert large.sum() > 3 * part.sum() and mask_iou(small, part) > 0.9
 
 
 def test_contradictory_clicks_are_named_all_at_once_and_left_out(photos):

@@ -231,6 +231,17 @@ def test_the_one_mask_that_disagrees_with_the_visual_hull_is_left_out_and_no_oth
     assert report["dropped"]["f4.png"] == f"IoU with the visual hull is {wrong:.2f}, below 0.6"
 
 
+def test_where_too_few_masks_agree_the_others_are_used_too_and_named(capture, tmp_path):
+    supplied = tmp_path / "supplied"
+    shutil.copytree(capture / "truth", supplied)
+    truth = cv2.imread(str(supplied / "f4_mask.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(supplied / "f4_mask.png"), np.roll(truth, np.ptp(np.nonzero(truth)[1]) // 2, axis=1))
+    run_stage(capture, tmp_path, method="supplied", prompts=None, supplied=supplied, min_photos=PHOTOS)
+    (note,) = value(read_json(tmp_path / "masks.json"), "notes")
+    assert f"fewer than {PHOTOS} masks agree with each other: those of f4.png are used although" in note
+    assert len(list((tmp_path / "masks").iterdir())) == PHOTOS
+
+
 def test_bad_supplied_masks_alone_are_an_error_in_one_sentence(capture, tmp_path):
     supplied = tmp_path / "supplied"
     supplied.mkdir()
@@ -290,9 +301,14 @@ def test_a_photo_that_disagrees_is_segmented_again_with_the_outline_of_the_other
     assert value(read_json(tmp_path / "masks.json"), "weights") == "own weights"
 
 
-def test_a_note_says_that_the_carried_masks_contradict_the_photo_that_was_clicked_in(capture, tmp_path, monkeypatch):
+@pytest.mark.parametrize("strict_is_right", [False, True])
+def test_propagated_masks_that_contradict_the_clicked_photo_are_made_once_more_and_said_if_they_stay(
+    capture, tmp_path, monkeypatch, strict_is_right
+):
     def elsewhere(*arguments):
         found = masks_from_prompts(*arguments)
+        if arguments[8:] and strict_is_right:
+            return found
         (k,) = (k for k, v in enumerate(arguments[3].views) if v.name == "f0.png")
         return dataclasses.replace(found, masks=[np.roll(m, 40 * (i == k), axis=1) for i, m in enumerate(found.masks)])
 
@@ -301,8 +317,10 @@ def test_a_note_says_that_the_carried_masks_contradict_the_photo_that_was_clicke
     rows = [f"inside\tf0.png\t{column}\t{y}\n" for column in (x, x - 9, x + 9)]
     (tmp_path / "clicks.tsv").write_text("label\tphoto\tx_px\ty_px\n" + "".join(rows))
     run_stage(capture, tmp_path, prompts=tmp_path / "clicks.tsv")
-    (note,) = value(read_json(tmp_path / "masks.json"), "notes")
-    assert "the clicks in f0.png contradict the masks there" in note
+    notes = value(read_json(tmp_path / "masks.json"), "notes")
+    assert ["the clicks in f0.png contradict the masks there" in note for note in notes] == [True] * (
+        not strict_is_right
+    )
 
 
 MARKS = {
