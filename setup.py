@@ -9,7 +9,9 @@ from setuptools.command.build_py import build_py
 NAMES = ("README.md", "config.yaml", "paper.yaml", "presets", "examples")
 CONFIG = tuple(f"config/{name}" for name in NAMES)
 """Not the demo's tables: an installed workflow works on those of a user."""
-SHIPPED = ("Snakefile", "workflow", "scripts", "profiles", "envs", *CONFIG)
+DOCUMENTS = tuple(path.as_posix() for path in sorted(Path("docs").rglob("*.md")))
+"""Messages name some of them."""
+SHIPPED = ("Snakefile", "workflow", "scripts", "profiles", "envs", *CONFIG, *DOCUMENTS)
 
 
 class WithWorkflow(build_py):

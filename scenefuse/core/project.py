@@ -100,7 +100,7 @@ def read_project(config: Mapping[str, Any], files: Iterable[Path] = ()) -> Proje
 def _checked_table(name: str, kind: str) -> dict[str, Row]:
     path = Path(name) if Path(name).is_file() else ROOT / name
     if not path.is_file():
-        raise StageError(f"{name} does not exist; write it as config/README.md describes")
+        raise StageError(f"{name} does not exist; write it as {ROOT}/config/README.md describes")
     rows = read_table(path, kind)
     for number, row in enumerate(rows.values(), 1):
         wrong = problem(row, schema_of(f"{kind}s"))

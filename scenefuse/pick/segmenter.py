@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, scratch_directory, threads
 from scenefuse.core.transforms import Array
-from scenefuse.masks.prompts import pixel_of
+from scenefuse.masks.prompts import OUTLINE_BAND_SHARE, pixel_of
 from scenefuse.pick.edits import Rows
 from scenefuse.pick.photo_tiles import MASK_PX, Picture, at_most, read_upright
 
@@ -221,17 +221,17 @@ class Segmenter:
 
 def corners(pixels: NDArray[np.uint8]) -> Array:
     """(N, 2) corners in a photo (H, W, 3), by FAST: the sky has none."""
-    found = cv2.FastFeatureDetector_create().detect(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
-    return np.asarray(cv2.KeyPoint_convert(found), dtype=np.float64).reshape(-1, 2)
+    found = cv2.FastFeatureDetector.create().detect(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
+    return np.array([corner.pt for corner in found]).reshape(-1, 2)
 
 
 def lies_in_nothing(mask: Mask, clicks: Array, known: Array) -> bool:
-    """Whether one of the clicks (N, 2) lies in a part of a mask (H, W) that holds none of the known pixels (M, 2)."""
-    # On its outline, the circle of seven pixels that FAST looks at shows what is beside it too.
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((7, 7), np.uint8))
-    _, parts = cv2.connectedComponents(inner)
-    at = [parts[rows, columns] for columns, rows in (pixel_of(clicks, mask), pixel_of(known, mask))]
-    return not set(at[0]) - {0} <= set(at[1])
+    """Whether one of the clicks (N, 2) lies in a part of a mask (H, W) that holds none of the known pixels (M, 2), but
+    near its outline, which is not exact."""
+    deep = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3) > OUTLINE_BAND_SHARE * max(mask.shape)
+    _, parts = cv2.connectedComponents(deep.astype(np.uint8))
+    (clicked, held) = (parts[rows, columns] for columns, rows in (pixel_of(clicks, mask), pixel_of(known, mask)))
+    return not set(clicked) - {0} <= set(held)
 
 
 def _clicks_of(picture: Picture, rows: Rows, width: int, height: int) -> "PhotoClicks":

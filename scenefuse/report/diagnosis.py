@@ -72,7 +72,7 @@ def _clicks(fields: Fields) -> Iterator[str]:
     if left_out:
         yield (
             f"clicks that disagree with the others and are left out ({len(left_out)}): {named(left_out, '; ')}; correct"
-            " them in the page to click in (docs/clicking.md), or delete them"
+            " them in the page that scenefuse pick opens, or delete them"
         )
 
 

@@ -16,6 +16,7 @@ from scenefuse.cloud.import_cloud import unit_and_name
 from scenefuse.cloud.readers.las import las_crs
 from scenefuse.cloud.strays import without_strays
 from scenefuse.cloud.write_las import write_laz
+from scenefuse.core.settings import ROOT
 from scenefuse.core.stage import StageError, atomic_file, quantity, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.core.version import VERSION
@@ -155,8 +156,10 @@ def register(
 def _advice(known: Known) -> str:
     """What a user can do about a refusal."""
     if known.fiducials is None and known.crop_box is None:
-        return "mark the object in the scene by --fiducials or --crop-box; docs/register.md lists further causes"
-    return "docs/register.md lists causes and what to do about each"
+        return (
+            f"mark the object in the scene by --fiducials or --crop-box; {ROOT}/docs/register.md lists further causes"
+        )
+    return f"{ROOT}/docs/register.md lists causes and what to do about each"
 
 
 def _clear(out: Path, inputs: list[Path]) -> None:

@@ -93,7 +93,7 @@ def wheel(tmp_path_factory):
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     for name in subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines():
-        if (ROOT / name).is_file() and not name.startswith(("tests/", "docs/")):
+        if (ROOT / name).is_file() and not name.startswith(("tests/", "docs/figures/", "docs/results/")):
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_bytes((ROOT / name).read_bytes())
     command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet", "-w", out, source]
@@ -115,10 +115,13 @@ def test_a_wheel_holds_the_library_and_the_workflow_and_not_the_tables_of_the_de
     with zipfile.ZipFile(wheel) as archive:
         held = set(archive.namelist())
     assert wheel.name.startswith(f"scenefuse-{VERSION}-py3-none-any")
-    assert {path.relative_to(ROOT).as_posix() for path in ROOT.glob("scenefuse/*/assets/*")} <= held
+    assert {path.relative_to(ROOT).as_posix() for path in ROOT.glob("scenefuse/**/assets/*")} <= held
     for folder in ("scripts", "workflow", "profiles", "envs"):
         files = [path for path in (ROOT / folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
         assert {f"scenefuse/shipped/{path.relative_to(ROOT).as_posix()}" for path in files} <= held
+    # Those that messages name.
+    assert {"scenefuse/shipped/docs/register.md", "scenefuse/shipped/docs/clicking.md"} <= held
+    assert {"scenefuse/shipped/config/README.md", "scenefuse/shipped/Snakefile"} <= held
     assert {"scenefuse/shipped/Snakefile", "scenefuse/shipped/config/config.yaml", "scenefuse/core/stage.py"} <= held
     assert not [name for name in held if name.endswith("/config/objects.tsv") or name.split("/")[0] == "tests"]
 

@@ -212,7 +212,7 @@ def test_the_variant_that_is_fused_comes_first_in_whatever_order_they_are_writte
         ({"gpu": "many"}, "config, gpu: 'many' does not match"),
         ({"registration": {"variants": ["full", "no_crops"]}}, "unknown variant 'no_crops'.*defines: full, paper"),
         ({"registration": {"variants": ["paper"]}}, "'full' is missing; it is the one that is fused"),
-        ({"objects": "nowhere.tsv"}, "nowhere.tsv does not exist; write it as config/README.md describes"),
+        ({"objects": "nowhere.tsv"}, "nowhere.tsv does not exist; write it as .*/config/README.md describes"),
     ],
 )
 def test_a_bad_setting_is_one_sentence_with_its_key(project, changes, sentence):
