@@ -7,6 +7,7 @@ export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
 demo: .venv/ready
 	snakemake --configfile config/demo.yaml --cores $(CORES)
+	python -m scenefuse export --configfile config/demo.yaml --cores $(CORES)
 
 # Unit tests that start no process; those of one package and what imports it: make check PART=masks.
 check: .venv/tests

@@ -90,10 +90,10 @@ def _settings_files() -> tuple[list[Path], list[str]]:
 
 
 def _export() -> None:
-    """make what is handed over of finished objects: surfaces, drawings, tiles, cameras"""
+    """make what is handed over of finished objects: surfaces, drawings, cameras"""
     parser = argparse.ArgumentParser(
         prog="scenefuse export",
-        description="Make surfaces, drawings, tiles and cameras of finished objects; nothing before them runs again.",
+        description="Make surfaces, drawings and cameras of finished objects; nothing before them runs again.",
         epilog="All other options are Snakemake's.",
     )
     parser.add_argument("--what", nargs="+", choices=EXPORTS, default=list(EXPORTS), help="all of them if not given")
@@ -105,7 +105,9 @@ def _export() -> None:
         which = f"object '{missing[0]}' has" if missing else "no object has"
         sys.exit(f"error: {which} a results/objects/NAME/fused.ply here; run the workflow first (scenefuse run)")
     rules, targets = zip(*(EXPORTS[what] for what in words.what))
-    wanted = {target.format(object=name) for target in targets for name in words.names or finished}
+    scenes = [path.parent.name for path in Path().glob("results/scenes/*/dense.ply")]
+    pairs = [(name, scene) for name in words.names or finished for scene in scenes]
+    wanted = {target.format(object=name, scene=scene) for target in targets for name, scene in pairs}
     sys.argv = [sys.argv[0], *sorted(wanted), *others, "--allowed-rules", *sorted({*rules, "make_surface"})]
     _run()
 
@@ -166,6 +168,7 @@ def _complete() -> None:
 EXPORTS = {
     "surface": ("make_surface", "results/objects/{object}/surface.json"),
     "drawings": ("draw_surface", "results/objects/{object}/drawings"),
+    "cameras": ("export_cameras", "results/scenes/{scene}/cameras"),
 }
 PARTS: dict[str, Callable[[], None]] = {
     "complete": _complete,

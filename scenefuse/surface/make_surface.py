@@ -27,8 +27,8 @@ class SurfaceInputs:
 
     fused: Path
     """The object in its surroundings (PLY)."""
-    fusion_json: Path
-    """JSON of the fusion, for the object's place in the scene."""
+    fusion_json: Path | None = None
+    """JSON of the fusion, for the object's place in the scene; without it the scene's cameras alone are used."""
     object_workspace: Path | None = None
     """The object's undistorted COLMAP workspace, where it has photos."""
     scene_workspace: Path | None = None
@@ -104,7 +104,7 @@ def paint(surface: Surface, views: list[tuple[Path, View]]) -> tuple[Textured | 
 def placed_views(inputs: SurfaceInputs) -> list[tuple[Path, View]]:
     """The cameras of both sides in the scene's frame, each with its workspace; an object without a place has none."""
     found = []
-    matrix = value(read_json(inputs.fusion_json), "scene_from_object")
+    matrix = None if inputs.fusion_json is None else value(read_json(inputs.fusion_json), "scene_from_object")
     if inputs.object_workspace is not None and matrix is not None:
         pose = Sim3.from_matrix(np.array(matrix))
         own = read_views(inputs.object_workspace / "sparse")

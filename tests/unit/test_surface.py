@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.core.transforms import look_at
+from scenefuse.core.transforms import Sim3, look_at
 from scenefuse.fuse.measure import Evidence
-from scenefuse.photos.workspace import View
+from scenefuse.photos.workspace import View, read_views, write_model
+from scenefuse.surface.cameras import export_cameras
 from scenefuse.surface.drawings import NOTHING, SIDES, Tag, draw_surface, wall_turn
 from scenefuse.surface.gltf import write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
@@ -244,3 +245,24 @@ def test_elevations_are_turned_to_the_walls():
         normals.append(np.tile(turn @ [1, 0, 0], (len(across), 1)))
     surface = make_mesh(with_evidence(np.concatenate(points), np.concatenate(normals)), [])
     assert np.degrees(wall_turn(surface)) == pytest.approx(20, abs=1)
+
+
+def test_cameras_of_both_sides_are_exported_in_the_frame_of_the_scene(tmp_path: Path):
+    pose = Sim3(2.0, Rotation.from_euler("z", 30, degrees=True).as_matrix(), np.array([5.0, 1, 0]))
+    for folder in ("scenes/yard", "objects/shed"):
+        (tmp_path / folder / "undistorted/sparse").mkdir(parents=True)
+        write_model(tmp_path / folder / "undistorted/sparse", from_above(3))
+    write_json(tmp_path / "objects/shed/fusion.json", {"scene_from_object": quantity(pose.matrix, "m")})
+    folder = tmp_path / "scenes/yard/cameras"
+    scene = tmp_path / "scenes/yard/undistorted"
+    export_cameras(scene_workspace=scene, objects=[tmp_path / "objects/shed"], folder=folder)
+    views = {view.name: view for view in read_views(folder)}
+    centre = from_above(3)[1].centre
+    assert len(views) == 6
+    assert np.allclose(views["scenes/yard/undistorted/images/1"].centre, centre)
+    assert np.allclose(views["objects/shed/undistorted/images/1"].centre, pose.apply(centre))
+    frames = {frame["file_path"]: frame for frame in read_json(folder / "transforms.json")["frames"]}
+    matrix = np.array(frames["../../../objects/shed/undistorted/images/1"]["transform_matrix"])
+    assert np.allclose(matrix[:3, 3], pose.apply(centre))
+    # OpenGL's cameras look along -z: down, here.
+    assert matrix[2, 2] > 0.99

@@ -2,6 +2,7 @@
 #
 # INPUTS    results/objects/{object}/fused.ply, fusion.json, undistorted/; results/scenes/{scene}/undistorted/, georeference.json
 # OUTPUTS   results/objects/{object}/surface.ply, surface.glb, surface.json, drawings/
+#           results/scenes/{scene}/cameras/
 
 
 rule make_surface:
@@ -63,3 +64,39 @@ rule draw_surface:
     shell:
         "exec python {params.script} --name {wildcards.object} --surface {input.surface} --glb {input.glb}"
         " --georeference-json {input.georeference} --folder {output} &> {log}"
+
+
+rule export_cameras:
+    """The cameras of a scene and of its objects in one frame: a COLMAP model and transforms.json."""
+    input:
+        scene_workspace=lambda wildcards: (
+            [f"results/scenes/{wildcards.scene}/undistorted"]
+            if scene_row(wildcards.scene).get("photos")
+            else []
+        ),
+        fusions=of_objects("fusion.json"),
+        workspaces=lambda wildcards: [
+            f"results/objects/{name}/undistorted"
+            for name in objects_in(wildcards)
+            if OBJECTS[name].get("photos")
+        ],
+    output:
+        directory("results/scenes/{scene}/cameras"),
+    log:
+        "results/logs/export_cameras/{scene}.log",
+    benchmark:
+        "results/benchmarks/export_cameras/{scene}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    resources:
+        mem_mb=2000,
+        runtime=lambda wildcards, attempt: 10 * attempt,
+    params:
+        objects=object_folders,
+        photos=options_of("scene_workspace"),
+        script=script("surface/export_cameras.py"),
+        code=code("surface/export_cameras.py"),
+    message:
+        "Scene {wildcards.scene}: cameras of both sides"
+    shell:
+        "exec python {params.script} {params.photos} --objects {params.objects} --folder {output} &> {log}"

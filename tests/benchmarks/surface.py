@@ -1,0 +1,129 @@
+"""Surfaces of the demo's objects against the truth: python tests/benchmarks/surface.py --results results
+
+For each object: F-scores of the completed cloud and of its surface, the error of bridged faces, shares of the area,
+PSNR of held-out photos' right halves inside the mask (gain fitted on the left; holes count), and processor time.
+"""
+
+import argparse
+import csv
+import resource
+from pathlib import Path
+
+import numpy as np
+
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.stage import read_json, value
+from scenefuse.core.transforms import Sim3
+from scenefuse.metrics.evaluate_object import read_object_truth, scene_scores, surface_to_find
+from scenefuse.metrics.true_cameras import read_cameras
+from scenefuse.metrics.truth import SAMPLES, Mesh, distances, sample_surface
+from scenefuse.photos.pictures import read_gray, read_rgb
+from scenefuse.surface.make_surface import SurfaceInputs, placed_views, surface_report
+from scenefuse.surface.mesh import FaceClass, cast, caster, make_mesh
+from scenefuse.surface.texture import textured
+
+FOLD = 8
+
+
+def seconds() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_utime
+
+
+def spread(surface, count: int) -> np.ndarray:
+    points = surface.vertices.points
+    middle = points.mean(0)
+    return middle + sample_surface(Mesh((points - middle).astype(np.float32), surface.faces.astype(np.int32)), count, 0)
+
+
+def rendered(view, painted) -> tuple[np.ndarray, np.ndarray]:
+    """The (H, W, 3) picture of a painted surface, and where it is."""
+    x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.intrinsics).T
+    surface = painted.surface
+    hit = cast(caster(surface.vertices.points, surface.faces), view.centre, rays @ view.cam_from_world[:3, :3])
+    on = np.flatnonzero(np.isfinite(hit["t_hit"]))
+    face, uv = hit["primitive_ids"][on].astype(int), hit["primitive_uvs"][on]
+    weights = np.column_stack([1 - uv.sum(1), uv])[..., None]
+    at = (
+        np.floor((painted.uv[face] * weights).sum(1) * len(painted.picture))
+        .astype(int)
+        .clip(0, len(painted.picture) - 1)
+    )
+    picture = np.zeros((view.height * view.width, 3))
+    picture[on] = painted.picture[at[:, 1], at[:, 0]]
+    shown = np.zeros(len(picture), dtype=bool)
+    shown[on[surface.classes[face] != FaceClass.BRIDGED]] = True
+    return picture.reshape(view.height, view.width, 3), shown.reshape(view.height, view.width)
+
+
+def psnr(folder: Path, found, views) -> float:
+    """Of held-out photos of the object, dB."""
+    own = [k for k, (workspace, _) in enumerate(views) if workspace == folder / "undistorted"]
+    held_out = own[FOLD // 2 :: FOLD]
+    rest = [views[k] for k in range(len(views)) if k not in held_out]
+
+    def read(number: int) -> np.ndarray:
+        workspace, view = rest[number]
+        return read_rgb(workspace / "images" / view.name)
+
+    painted, scores = textured(found, [view for _, view in rest], read), []
+    for workspace, view in (views[k] for k in held_out):
+        photo = read_rgb(workspace / "images" / view.name).astype(float)
+        mask = read_gray(folder / "masks" / f"{Path(view.name).stem}.png") > 127
+        picture, shown = rendered(view, painted)
+        left, right = mask & shown, mask.copy()
+        left[:, view.width // 2 :], right[:, : view.width // 2] = False, False
+        gain = np.exp(np.median(np.log(np.maximum(photo[left], 1) / np.maximum(picture[left], 1)), axis=0))
+        scores.append(10 * np.log10(255**2 / ((np.clip(gain * picture, 0, 255) - photo)[right] ** 2).mean()))
+    return float(np.mean(scores))
+
+
+def row(results: Path, name: str) -> dict[str, str]:
+    folder, scene, truth = results / "objects" / name, results / "scenes/demo", results / "demo/demo/truth"
+    cloud, start = read_cloud(folder / "fused.ply"), seconds()
+    inputs = SurfaceInputs(folder / "fused.ply", folder / "fusion.json", folder / "undistorted", scene / "undistorted")
+    views = placed_views(inputs)
+    found = make_mesh(cloud, [view for _, view in views])
+    mesh_s, start = seconds() - start, seconds()
+    dB = psnr(folder, found, views)
+    texture_s = seconds() - start
+    known = read_object_truth(folder / "undistorted", truth / "scene", truth / name, SAMPLES, 0)
+    place = Sim3.from_matrix(np.array(value(read_json(scene / "truth.json"), "truth_from_scene")))
+    surface = surface_to_find(known, read_cameras(truth / "scene/cameras.json"))
+    scores = [scene_scores(place.apply(p), known, surface) for p in (cloud.points, spread(found, 400_000))]
+    bridged = place.apply(spread(found.part(found.classes == FaceClass.BRIDGED), 20_000))
+    error = (
+        np.minimum(distances(known.mesh.caster(), bridged), distances(known.rest.caster(), bridged)) / known.diagonal
+    )
+    report = surface_report(found, "m")
+    return {
+        "object": name,
+        **{
+            f"{what}_f_{at}": f"{one[at]['f_score']:.3f}"
+            for what, one in zip(("cloud", "surface"), scores)
+            for at in ("025pct", "05pct", "1pct")
+        },
+        **{share: f"{value(report, share):.3f}" for share in ("measured", "unconfirmed", "bridged", "open")},
+        "bridged_within_1pct": f"{(error <= 0.01).mean():.3f}",
+        "psnr_db": f"{dB:.1f}",
+        "nerf_psnr_db": f"{value(read_json(folder / 'stage4.json'), 'psnr_right_half_fitted_on_left'):.1f}",
+        "mesh_s": f"{mesh_s:.0f}",
+        "texture_s": f"{texture_s:.0f}",
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--results", type=Path, default=Path("results"))
+    parser.add_argument("--table", type=Path, default=Path("docs/results/surface.tsv"))
+    parser.add_argument("--objects", nargs="+", default=["house", "balloon", "sculpture"])
+    given = parser.parse_args()
+    rows = [row(given.results, name) for name in given.objects]
+    with open(given.table, "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), delimiter="\t", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
