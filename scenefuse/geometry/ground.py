@@ -8,8 +8,8 @@ from scenefuse.core.transforms import Array
 
 # Cells along each side of the square around the ring; one low point stands for each.
 CELLS = 40
-# Fewer points, or cells, than these fix no ground.
-MIN_POINTS, MIN_CELLS = 50, 20
+# Fewer cells than these fix no ground.
+MIN_CELLS = 20
 # Triples of cells drawn; the plane must hold this share of the cells, and rise by less than 45 degrees.
 TRIPLES, MIN_SHARE = 400, 0.3
 # Cells of a strip narrower than this share of its length, a ledge or the foot of a wall, fix no slope across it.
@@ -67,7 +67,7 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
     near = ((xy >= low[:2] - ring) & (xy <= high[:2] + ring)).all(1)
     inside = ((xy >= low[:2]) & (xy <= high[:2])).all(1)
     around = points[near & ~inside]
-    if len(around) < MIN_POINTS:
+    if not len(around):
         return None
     lowest = _lowest(around, low[:2] - ring, float((high[:2] - low[:2] + 2 * ring).max()) / CELLS)
     if len(lowest) < MIN_CELLS:

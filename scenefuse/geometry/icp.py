@@ -1,8 +1,11 @@
-"""ICP for similarities: two surfaces by Tukey-weighted points, then by planes and colours; sparse points on a cloud."""
+"""Similarities by ICP and RANSAC: two surfaces by Tukey-weighted points, then by planes and colours; sparse points on a
+cloud; triples of matches."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -21,6 +24,9 @@ MAX_SCALE_STEP = 0.05
 # Of a model's points that are laid on a cloud, this share counts, those nearest: others are off its surface, or
 # mismatched.
 NEAREST_SHARE = 0.7
+# How much the scales of a triple's three edges may differ, least over largest; triples that are tried on all matches;
+# their best poses, which are refined.
+MIN_EDGE_RATIO, MAX_TRIPLES, RANSAC_POSES = 0.9, 2000, 8
 
 
 @dataclass(frozen=True)
@@ -243,3 +249,37 @@ def _weighted(lever: Array, direction: Array, residual: Array, weight: Array) ->
     jacobian = similarity_rows(lever, direction)
     weighted = weight[:, None] * jacobian
     return weighted.T @ jacobian, weighted.T @ residual
+
+
+class Triples(NamedTuple):
+    """Triples of matches.
+
+    Attributes:
+        rows: (N, 3) of the matches.
+        edges: lengths (N, 3) of their edges on either side.
+        scale: (N,) geometric mean of the three edges' ratios.
+    """
+
+    rows: NDArray[np.int64]
+    edges: tuple[Array, Array]
+    scale: Array
+
+
+def triples_of_one_scale(
+    x: Array, y: Array, count: int, rng: np.random.Generator, min_ratio: float = MIN_EDGE_RATIO
+) -> Triples:
+    """Random triples of matches whose three edges are longer on one side by nearly the same factor (Fischler 1981).
+
+    Args:
+        x: (M, 3) points of one side.
+        y: (M, 3) their partners.
+        count: triples drawn.
+        rng: draws them.
+        min_ratio: least of a triple's three factors over the largest.
+    """
+    rows = rng.integers(0, len(x), (count, 3))
+    a, b = (np.linalg.norm(side[rows] - side[np.roll(rows, 1, axis=1)], axis=2) for side in (x, y))
+    ratio = b / np.maximum(a, 1e-12)
+    good = ratio.min(1) > min_ratio * ratio.max(1)
+    scale = np.exp(np.log(np.maximum(ratio[good], 1e-12)).mean(1))
+    return Triples(rows[good], (a[good], b[good]), scale)

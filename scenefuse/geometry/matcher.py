@@ -26,7 +26,6 @@ GREY_FALL, MAX_GREY_STEP = 0.07, 0.28
 DISTANCE_FALL = 0.6
 # Score of a hypothesis outside a source photo: worse than a window that does not match.
 OUTSIDE_SCORE = -0.5
-_ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _MATH = {"contract", "reassoc", "nsz"}
 
 
@@ -48,14 +47,10 @@ class Matcher:
         best_sources: int,
         window_px: int,
         device: torch.device | str,
-        flat: float = NOISE_VARIANCE,
     ) -> None:
-        """Place each pixel's ray in each source photo; `pixels` of all are (H, W) float32 grey values in 0..1.
-
-        `flat` is the variance that is added to all windows', see NOISE_VARIANCE.
-        """
+        """Place each pixel's ray in each source photo; `pixels` of all are (H, W) float32 grey values in 0..1."""
         height, width = reference.height, reference.width
-        self.best, self.flat = min(best_sources, len(sources)), flat
+        self.best = min(best_sources, len(sources))
         u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         rays = np.linalg.inv(reference.intrinsics) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
         rotation, shift = reference.cam_from_world[:3, :3], reference.cam_from_world[:3, 3]
@@ -90,7 +85,7 @@ class Matcher:
     def _keep_best_on_cpu(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
         """The same as `keep_best`, by the CPU's kernel."""
         first, last = (inverse.contiguous(), self.windows, self.weights), (gray[0, 0], directions, move, best)
-        keep_best_on_cpu(*(p.numpy() for p in first), np.float32(self.flat), *(p.numpy() for p in last))  # type: ignore[call-arg]
+        keep_best_on_cpu(*(p.numpy() for p in (*first, *last)))  # type: ignore[call-arg]
 
     def keep_best(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
         """Put the scores of one of `sources` among the best (K, D, h, w), the largest first."""
@@ -122,7 +117,7 @@ class Matcher:
         mean = self._mean(warped)
         variance = (self._mean(warped * warped) - mean * mean).clamp(min=0)
         covariance = self._mean(warped * self.reference) - mean * self.mean
-        ncc = covariance / torch.sqrt((variance + self.flat) * (self.variance + self.flat))
+        ncc = covariance / torch.sqrt((variance + NOISE_VARIANCE) * (self.variance + NOISE_VARIANCE))
         return torch.where(inside, ncc, torch.full_like(ncc, OUTSIDE_SCORE))
 
     def _mean(self, values: Tensor) -> Tensor:
@@ -218,18 +213,19 @@ def _place(inverse, directions, move, y, width, height, place, part_x, part_y, i
     and height of the source photo. Written: place (w,) int32 index of the upper left pixel of four, part_x and part_y
     (w,) the place between them in 0..1, inside (w,) 1 where it lies in the photo, else 0.
     """
+    zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     direction_x, direction_y, direction_z = directions[0, y], directions[1, y], directions[2, y]
-    half_x, half_y = np.float32(width) * _HALF, np.float32(height) * _HALF
+    half_x, half_y = np.float32(width) * half, np.float32(height) * half
     last_x, last_y = np.float32(width - 1), np.float32(height - 1)
     end_x, end_y = np.int32(width - 2), np.int32(height - 2)
     for x in range(len(inverse)):
         z = direction_z[x] + move[2] * inverse[x]
-        scale = _ONE / max(z, np.float32(1e-6))
+        scale = one / max(z, np.float32(1e-6))
         u = (direction_x[x] + move[0] * inverse[x]) * scale
         v = (direction_y[x] + move[1] * inverse[x]) * scale
-        inside[x] = _ONE if (z > np.float32(1e-6)) & (abs(u) < _ONE) & (abs(v) < _ONE) else _ZERO
-        px = min(max((u + _ONE) * half_x - _HALF, _ZERO), last_x)
-        py = min(max((v + _ONE) * half_y - _HALF, _ZERO), last_y)
+        inside[x] = one if (z > np.float32(1e-6)) & (abs(u) < one) & (abs(v) < one) else zero
+        px = min(max((u + one) * half_x - half, zero), last_x)
+        py = min(max((v + one) * half_y - half, zero), last_y)
         # Whatever a depth that is not a number gives, it is a pixel of the photo.
         x0 = np.int32(max(min(np.int32(px), end_x), np.int32(0)))
         y0 = np.int32(max(min(np.int32(py), end_y), np.int32(0)))
@@ -262,7 +258,7 @@ def _sums_along(value, reference, weight, sums):
     inner = row[radius : radius + width]
     for k in range(3):
         for x in range(width):
-            inner[x] = value[x] * (_ONE if k == 0 else value[x] if k == 1 else reference[x])
+            inner[x] = value[x] * (np.float32(1.0) if k == 0 else value[x] if k == 1 else reference[x])
         out, share = sums[k * width : (k + 1) * width], weight[0]
         for x in range(width):
             out[x] = share[x] * row[x]
@@ -292,20 +288,20 @@ def _sum_across(rows, first, weight, total):
 
 
 @njit(fastmath=_MATH, error_model="numpy")
-def _correlate(sums, mean, variance, inside, flat, score):
+def _correlate(sums, mean, variance, inside, score):
     """Normalised cross-correlation of a row's windows, into score (w,).
 
     sums (3 w,): weighted means over whole windows, as `_sums_along` orders them; mean and variance (w,) of the
-    reference's windows; inside (w,) as `_place` writes it; flat: variance that is added to all.
+    reference's windows; inside (w,) as `_place` writes it.
     """
-    width = len(score)
+    width, flat = len(score), np.float32(NOISE_VARIANCE)
     first, second, both = sums[:width], sums[width : 2 * width], sums[2 * width :]
     for x in range(width):
         average = first[x]
-        spread = max(second[x] - average * average, _ZERO)
+        spread = max(second[x] - average * average, np.float32(0.0))
         covariance = both[x] - average * mean[x]
         ncc = covariance / math.sqrt((spread + flat) * (variance[x] + flat))
-        score[x] = ncc if inside[x] > _ZERO else np.float32(OUTSIDE_SCORE)
+        score[x] = ncc if inside[x] > np.float32(0.0) else np.float32(OUTSIDE_SCORE)
 
 
 @njit
@@ -318,13 +314,13 @@ def _insert(score, best):
 
 
 @njit(parallel=True, cache=True)
-def keep_best_on_cpu(inverse, windows, weights, flat, gray, directions, move, best):  # type: ignore[no-untyped-def]
+def keep_best_on_cpu(inverse, windows, weights, gray, directions, move, best):  # type: ignore[no-untyped-def]
     """Match D hypotheses per pixel in one source photo, and keep the best scores seen so far.
 
     All float32: inverse (D, h, w) inverse depths; windows (3, h, w) the reference, and the mean and variance of its
-    windows; weights (2, h, window, w) along the rows and across them, as `support_weights` makes them; flat: variance
-    that is added to all windows'; gray (H, W) source photo; directions (3, h, w) and move (3,) give its places in
-    -1..1; best (K, D, h, w), sorted, the largest first: changed in place.
+    windows; weights (2, h, window, w) along the rows and across them, as `support_weights` makes them; gray (H, W)
+    source photo; directions (3, h, w) and move (3,) give its places in -1..1; best (K, D, h, w), sorted, the largest
+    first: changed in place.
     """
     reference, mean, variance = windows[0], windows[1], windows[2]
     along, across = weights[0], weights[1]
@@ -348,10 +344,10 @@ def keep_best_on_cpu(inverse, windows, weights, flat, gray, directions, move, be
                 _warp(pixels, np.uint32(size_x), place, part_x, part_y, value)
                 _sums_along(value, reference[y], along[y], sums[slot])
             else:
-                sums[slot] = _ZERO
+                sums[slot] = np.float32(0.0)
             middle = y - radius
             if middle >= top:
                 _sum_across(sums, (slot + 1) % window, across[middle], total)
-                _correlate(total, mean[middle], variance[middle], inside[middle % window], flat, score)
+                _correlate(total, mean[middle], variance[middle], inside[middle % window], score)
                 for k in range(best.shape[0]):
                     _insert(score, best[k, d, middle])

@@ -24,8 +24,6 @@ CONFIRMING_PHOTOS = 3
 MAX_DEVIATION_PX = 1.2
 # Photos of one side that points are checked in at most, and the share of an object that a photo must show.
 MAX_PHOTOS, MIN_SHOWN_SHARE = 64, 0.02
-# How often a point that photos match nowhere near is tried again in photos of half the size.
-HALVINGS = 1
 # Of how far the best match lies from a point: the point is off by a part of it, the match by the rest. This and the
 # next two by the likelihood of the errors of the demo's house and sculpture, once aligned to the truth.
 PEAK_FACTOR = 0.6
@@ -177,11 +175,10 @@ def match_in(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Mat
     blur hides in single pixels may show there, and less exactly.
     """
     found = _match(points, normals, photos)
-    for _ in range(HALVINGS):
-        photos, rest = halved(photos), np.flatnonzero(~found.measured & (found.best < MIN_MATCH))
-        coarse = _match(points[rest], None if normals is None else normals[rest], photos)
-        for kept, tried in zip(vars(found).values(), vars(coarse).values()):
-            kept[rest[coarse.measured]] = tried[coarse.measured]
+    rest = np.flatnonzero(~found.measured & (found.best < MIN_MATCH))
+    coarse = _match(points[rest], None if normals is None else normals[rest], halved(photos))
+    for kept, tried in zip(vars(found).values(), vars(coarse).values()):
+        kept[rest[coarse.measured]] = tried[coarse.measured]
     return found
 
 

@@ -20,8 +20,8 @@ MIN_COSINE = 0.25
 # second is as good as any up to half way to the last.
 MIN_ANGLE, GOOD_ANGLE, MAX_ANGLE = math.radians(3), math.radians(12), math.radians(60)
 # Photos that a point is seen from as reference, one after the other, and the least angle between them; no other one is
-# tried where so many photos confirm the point.
-REFERENCES, REFERENCE_ANGLE, ENOUGH = 3, math.radians(20), 4
+# tried where it and as many as count confirm the point.
+REFERENCES, REFERENCE_ANGLE = 3, math.radians(20)
 # Grey levels (one standard deviation) that a photo's pixels are off at least.
 NOISE = 1.5
 
@@ -271,7 +271,7 @@ def match_points(  # type: ignore[no-untyped-def]
             _photos_of(point, normal, projections, centres, focals, sizes, quality, cosine)
             for attempt in range(REFERENCES):
                 ref = _next_reference(point, centres, quality, tried, attempt)
-                if ref < 0 or confirming[i] >= ENOUGH:
+                if ref < 0 or confirming[i] > BEST:
                     break
                 tried[attempt] = ref
                 others = _choose(point, ref, centres, quality, chosen, angles, worth)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from scenefuse.core.stage import setting
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.matcher import Matcher, box, support_weights, supported_mean
+from scenefuse.geometry.matcher import NOISE_VARIANCE, Matcher, box, support_weights, supported_mean
 from scenefuse.photos.workspace import View
 
 # Side of the windows that planes are fitted in, for depths and for normals: windows of 5 let the depths of single
@@ -306,7 +306,7 @@ def is_measured(matcher: Matcher, inverse: Tensor, score: Tensor, min_score: flo
     """
     away = PEAK_DISTANCE_PX * pixel
     beside = matcher.score(torch.stack([inverse - away, inverse + away])).amax(0)
-    noise = matcher.flat / matcher.variance.clamp(min=1e-12)
+    noise = NOISE_VARIANCE / matcher.variance.clamp(min=1e-12)
     measured = (score >= min_score) & (score - beside >= MIN_GAIN + MIN_GAIN_PER_NOISE * noise)
     return measured & ~_among_blank(matcher, measured)
 
@@ -314,7 +314,7 @@ def is_measured(matcher: Matcher, inverse: Tensor, score: Tensor, min_score: flo
 def _among_blank(matcher: Matcher, measured: Tensor) -> Tensor:
     """True (h, w) where of the pixels around that look alike too many have neither texture nor a measurement."""
     weights = support_weights(matcher.reference, NORMAL_PX)
-    known, blank = measured.float(), (~measured & (matcher.variance < matcher.flat)).float()
+    known, blank = measured.float(), (~measured & (matcher.variance < NOISE_VARIANCE)).float()
     for _ in range(2):
         known, blank = (supported_mean(values, weights) for values in (known, blank))
     return blank > MAX_BLANK_SHARE * (known + blank)

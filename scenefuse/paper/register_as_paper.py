@@ -28,8 +28,7 @@ from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import quantity, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.geometry.alignment_picture import draw_alignment
-from scenefuse.geometry.icp import ScaleRange
-from scenefuse.geometry.ransac import triples_of_one_scale
+from scenefuse.geometry.icp import ScaleRange, triples_of_one_scale
 from scenefuse.register.coarse import COARSE_POINTS, coarse_quantities
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.fine import ledger_row, pose_quantities
@@ -165,7 +164,7 @@ def agreeing(source: Array, target: Array, distance: float, seed: int) -> NDArra
     best = np.zeros(len(source), dtype=bool)
     rng, drawn, wanted, at_once = np.random.default_rng(seed), 0, float(RANSAC_SAMPLES), 1 << 14
     while len(source) and drawn < wanted:
-        triples, drawn = triples_of_one_scale(source, target, at_once, EDGE_LENGTH, rng), drawn + at_once
+        triples, drawn = triples_of_one_scale(source, target, at_once, rng, EDGE_LENGTH), drawn + at_once
         for rows in triples.rows[np.abs(np.log(triples.scale)) < np.log(MAX_SCALE_FACTOR)]:
             try:
                 pose = fit_sim3(source[rows], target[rows])

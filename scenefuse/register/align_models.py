@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import quantity, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.geometry.ransac import triples_of_one_scale
-from scenefuse.register.gps import MAX_GPS_DEVIATIONS, GpsPose, gps_quantities, pose_by_gps
+from scenefuse.geometry.icp import MAX_TRIPLES, RANSAC_POSES, triples_of_one_scale
+from scenefuse.register.gps import GpsPose, gps_quantities, pose_by_gps
 from scenefuse.register.landmarks import Landmarks, match_landmarks, read_landmarks
 from scenefuse.register.reprojection import (
     Observations,
@@ -24,12 +24,10 @@ from scenefuse.register.reprojection import (
     minimise_reprojection,
     observations,
 )
-from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities
+from scenefuse.register.uncertainty import MAX_DEVIATIONS, Uncertainty, uncertainty_quantities
 
-# Random triples of matches drawn, those of them fitted, the matches that rank these, the best that are refined.
-RANSAC_SAMPLES, MAX_PROPOSALS, RANKING_MATCHES, FINALISTS = 100_000, 2000, 300, 10
-# How much the scales of a triple's three edges may differ, least over largest.
-MIN_EDGE_RATIO = 0.8
+# Random triples of matches drawn, and the matches that rank those which are tried.
+RANSAC_SAMPLES, RANKING_MATCHES = 100_000, 300
 # Largest reprojection error of an inlier, RMS, in pixels of the coarser photos.
 MAX_ERROR_PX = 6.0
 # The gate: inliers of the best pose among the other matches, over inliers; standard deviations of scale and rotation.
@@ -171,7 +169,7 @@ def _by_gps(seen: Observations, consensus: Consensus, gps: GpsPose, at: Array, s
         rest = seen.subset(np.min([match_errors(seen, pose) for pose in poses], axis=0) > 3 * MAX_ERROR_PX)
         other = _most_supported(rest, seed)
         rival = 0 if other is None else int((match_errors(rest, other) <= MAX_ERROR_PX).sum())
-    allowed = [pose for pose in poses if gps.miss(pose, at) <= MAX_GPS_DEVIATIONS]
+    allowed = [pose for pose in poses if gps.miss(pose, at) <= MAX_DEVIATIONS]
     if len(poses) == 1 or len(allowed) != 1 or len(poses) == most:
         return consensus
     print(f"GPS settles which of {len(poses)} poses it is", flush=True)
@@ -183,16 +181,16 @@ def _most_supported(seen: Observations, seed: int) -> Sim3 | None:
     if len(seen.x) < 4:
         return None
     rng = np.random.default_rng(seed)
-    found = triples_of_one_scale(seen.x, seen.y, RANSAC_SAMPLES, MIN_EDGE_RATIO, rng)
+    found = triples_of_one_scale(seen.x, seen.y, RANSAC_SAMPLES, rng)
     wide = found.edges[0].min(1) > 0.1 * found.edges[0].max(1)
     proposed = []
-    for triple in found.rows[wide][:MAX_PROPOSALS]:
+    for triple in found.rows[wide][:MAX_TRIPLES]:
         with contextlib.suppress(ValueError):
             proposed.append(fit_sim3(seen.x[triple], seen.y[triple]))
     if not proposed:
         return None
     few = seen.subset(np.isin(np.arange(len(seen.x)), rng.permutation(len(seen.x))[:RANKING_MATCHES]))
-    finalists = sorted(proposed, key=lambda p: _cost(few, p, 2 * MAX_ERROR_PX))[:FINALISTS]
+    finalists = sorted(proposed, key=lambda p: _cost(few, p, 2 * MAX_ERROR_PX))[:RANSAC_POSES]
     return min((_polished(seen, p) for p in finalists), key=lambda p: _cost(seen, p, MAX_ERROR_PX))
 
 

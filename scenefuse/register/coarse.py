@@ -13,8 +13,7 @@ from scipy import fft
 
 from scenefuse.core.stage import quantity, threads, write_json
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
-from scenefuse.geometry.icp import ScaleRange, refine_points
-from scenefuse.geometry.ransac import triples_of_one_scale
+from scenefuse.geometry.icp import MAX_TRIPLES, RANSAC_POSES, ScaleRange, refine_points, triples_of_one_scale
 from scenefuse.geometry.surface import Surface, prepare, with_grid, with_queries
 from scenefuse.register.problem import Constraints, Inputs, Problem, ScaleSettings, estimates, prior, scale_quantities
 from scenefuse.register.score import RECALL_WEIGHT, SCORE_FRACTION, Hypothesis, best_distinct, score
@@ -26,13 +25,7 @@ COARSE_POINTS = 6000
 QUERY_POINTS = 1200
 # Voxel of the upright sweep, as a share of the scene crop's diagonal: a fast Fourier transform of some 50^3 cells.
 SWEEP_VOXEL_FRACTION = 0.045
-# RANSAC's best poses at each voxel and feature scale.
-RANSAC_POSES = 8
 BRIEF_ROUNDS = 12
-# Triples that pass the checks and are tried on all matches: as many as fit into memory at once.
-MAX_TRIPLES = 2000
-# How much the scales of a triple's three edges may differ, least over largest.
-MIN_EDGE_RATIO = 0.9
 
 
 @dataclass(frozen=True)
@@ -214,7 +207,7 @@ def ransac_similarities(
     if len(x) < 3:
         return []
     rng = np.random.default_rng(seed)
-    triples, edges, middle = triples_of_one_scale(x, y, samples, MIN_EDGE_RATIO, rng)
+    triples, edges, middle = triples_of_one_scale(x, y, samples, rng)
     good = (edges[1].min(1) > 3 * tau) & (np.abs(np.log(middle / scales.centre)) <= scales.width + 0.05)
     triples, middle = triples[good], middle[good]
     if len(triples) == 0:

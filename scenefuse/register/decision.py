@@ -11,7 +11,7 @@ from scenefuse.core.stage import setting
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.geometry.surface import Surface
 from scenefuse.register.problem import Problem
-from scenefuse.register.repetition import END_PERCENTILES
+from scenefuse.register.repetition import END_PERCENTILES, MIN_SELF_AGREEMENT
 from scenefuse.register.score import (
     DISTINCT_ANGLE_DEG,
     DISTINCT_SHIFT,
@@ -30,12 +30,12 @@ DecidedBy = Literal["geometry", "near", "photos", "both"]
 MIN_RECALL = 0.4
 # The agreement of the colours, where both clouds have colours that vary.
 MIN_COLOR = 0.5
-# The angle between the up directions.
-MAX_TILT_DEG = 8.0
+# The angle between the up directions: beyond that the pose is another one.
+MAX_TILT_DEG = DISTINCT_ANGLE_DEG
 # The share of the object in the scene's free space.
 MAX_FREE_SPACE_VIOLATION = 0.25
-# A motion maps an object onto itself when this share of its points meets others, and its colours agree as much.
-MIN_SELF_OVERLAP, MIN_SELF_COLOR = 0.95, 0.9
+# A motion maps an object onto itself when its colours agree as much, beside the share of its points that meet others.
+MIN_SELF_COLOR = 0.9
 # The pose may be off by this share of the diagonal (`Uncertainty.size`) because the object's own model is bent.
 MAX_BENDING = 0.1
 
@@ -293,4 +293,4 @@ def _turns_onto_itself(obj: Surface, motion: Sim3, tau: float) -> bool:
     pairs = pair(obj, obj, motion, tau)
     ahead, back = pairs.forward / len(obj.queries), (len(pairs.distance) - pairs.forward) / len(obj.queries)
     color = color_agreement(obj, obj, pairs)
-    return min(ahead, back) > MIN_SELF_OVERLAP and (color is None or color > MIN_SELF_COLOR)
+    return min(ahead, back) > MIN_SELF_AGREEMENT and (color is None or color > MIN_SELF_COLOR)

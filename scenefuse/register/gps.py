@@ -12,12 +12,11 @@ from scenefuse.georef.placement import MIN_GPS_PHOTOS, GeoreferenceSettings, pla
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.photos import gps_accuracies, gps_positions, read_photos
 from scenefuse.register.landmarks import Landmarks
+from scenefuse.register.uncertainty import MAX_DEVIATIONS
 from scenefuse.sfm.gravity import estimate_up
 
 # Errors of GPS drift slowly: so many photos that follow each other err alike.
 CORRELATED_PHOTOS = 5
-# A pose farther off than so many standard deviations is another one.
-MAX_GPS_DEVIATIONS = 4.0
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ def gps_quantities(gps: GpsPose | None, pose: Sim3 | None, at: Array | None) -> 
         else:
             scale, heading, shift = gps.differences(pose, at)
             miss, heading = gps.miss(pose, at), float(np.degrees(heading))
-            if miss > MAX_GPS_DEVIATIONS:
+            if miss > MAX_DEVIATIONS:
                 notes.append(
                     f"{about} contradicts the pose: {np.expm1(abs(scale)):.1%} of scale, {abs(heading):.1f} degrees and"
                     f" {shift:.1f} m in the plane apart, and GPS is known to {gps.turn_sd:.1%},"

@@ -15,18 +15,15 @@ from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, moved_about, similarity_rows
 from scenefuse.geometry.surface import Surface
-from scenefuse.register.score import SCORE_FRACTION
-from scenefuse.register.uncertainty import Uncertainty
+from scenefuse.register.score import MIN_COLOR_NOISE, SCORE_FRACTION
+from scenefuse.register.uncertainty import MAX_DEVIATIONS, Uncertainty
 
 # Object points from which a scene point may come: those within two deviations, at the usual spacing and noise.
 NEIGHBOURS = 24
-# A scene point this many standard deviations from the object, in place and colour, is as likely something else.
-MAX_DEVIATIONS = 4.0
 # The noise begins at the distance within which points agree, a share of the scene's diagonal.
 START_NOISE = SCORE_FRACTION
-# It never gets below this share of the object's spacing, nor that of colours (0..1) below MIN_COLOR_NOISE: samples a
-# spacing apart tell no more.
-MIN_NOISE, MIN_COLOR_NOISE = 0.75, 0.03
+# It never gets below this share of the object's spacing: samples a spacing apart tell no more.
+MIN_NOISE = 0.75
 # Pieces to the scene's diagonal, and how many there must be: what errs together stays together.
 PIECES_ACROSS, MIN_PIECES = 6, 8
 # Copies of the scene that are drawn from the object, at a pose that is known.

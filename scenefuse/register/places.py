@@ -22,11 +22,11 @@ WINDOW_SIZES = 5
 WINDOW_CELLS, OPENING = 8, 1.5
 # A part rises by this share of the window, and by twice that, where it parts from what stands beside it.
 MIN_RISE = 0.15
-# Places that are compared with the object, and points of either side whose pairs are.
-MAX_PLACES, COMPARED_POINTS = 6, 350
 
 
-def likely_places(obj: Cloud, scene: Cloud, up: Array | None, settings: CropSettings, seed: int) -> list[Rows]:
+def likely_places(
+    obj: Cloud, scene: Cloud, up: Array | None, settings: CropSettings, seed: int, most: int
+) -> list[Rows]:
     """Rows of the scene's points on each of the parts that are most like the object, best first.
 
     Args:
@@ -36,6 +36,7 @@ def likely_places(obj: Cloud, scene: Cloud, up: Array | None, settings: CropSett
             least, or its reverse.
         settings: of the crop around each.
         seed: of the points that are compared.
+        most: parts at most.
     """
     directions = [up] if up is not None else _thinnest(scene)
     found = []
@@ -46,10 +47,11 @@ def likely_places(obj: Cloud, scene: Cloud, up: Array | None, settings: CropSett
     alike = [max(_alike(_signature(_thin(scene[rows], seed), seed), view) for view in views) for _, rows in found]
     places: list[Rows] = []
     for k in np.argsort([-value for value in alike], kind="stable"):
-        rows = _cropped(scene, *found[k], settings)
+        direction, rows = found[k]
+        rows = _cropped(scene, direction, rows, settings)
         if len(rows) >= MIN_POINTS and not any(_same(rows, other) for other in places):
             places.append(rows)
-        if len(places) == MAX_PLACES:
+        if len(places) == most:
             break
     return places
 
@@ -108,7 +110,7 @@ def _same(rows: Rows, other: Rows) -> bool:
 
 def _thin(cloud: Cloud, seed: int) -> Surface:
     """A cloud's surface with one point a voxel, whatever its unit."""
-    return prepare(cloud, SCORE_FRACTION * cloud.diagonal, seed, 10 * COMPARED_POINTS)
+    return prepare(cloud, SCORE_FRACTION * cloud.diagonal, seed, 10 * MIN_POINTS)
 
 
 def _views(obj: Surface) -> Iterator[Surface]:
@@ -122,7 +124,7 @@ def _views(obj: Surface) -> Iterator[Surface]:
 def _signature(surface: Surface, seed: int) -> tuple[Array, Array | None]:
     """What does not change when a surface is turned, moved and scaled: of its pairs of points the distance, the angle
     of the normals, and of these with the line between (Wahl, Hillenbrand, Hirzinger 2003); and its hues."""
-    rows = np.random.default_rng(seed).permutation(surface.queries)[:COMPARED_POINTS]
+    rows = np.random.default_rng(seed).permutation(surface.queries)[:MIN_POINTS]
     points, normals = surface.points[rows], surface.normals[rows]
     a, b = np.triu_indices(len(rows), 1)
     line = points[b] - points[a]

@@ -19,8 +19,6 @@ from scenefuse.sfm.gravity import UNSURE_CUES
 
 # Points on a line leave the turn about it open: below this ratio of the two largest RMS extents no pose is sought.
 MIN_BREADTH = 1e-3
-# An extent below this share of the diagonal is noise, of a flat roof seen from above for instance: no ratio of it.
-MIN_EXTENT = 0.01
 
 
 @dataclass(frozen=True)
@@ -214,7 +212,8 @@ def estimates(obj: Cloud, scene: Cloud, ups: tuple[Array, Array] | None) -> list
             "footprint": [_hull_size(p[:, :2]) for p in level],
             "height": [float(np.ptp(np.percentile(p[:, 2], [1, 99]))) for p in level],
         }
-    least = [MIN_EXTENT * cloud.diagonal for cloud in (obj, scene)]
+    # Half the distance within which points agree: less is noise, of a flat roof seen from above for instance.
+    least = [SCORE_FRACTION / 2 * cloud.diagonal for cloud in (obj, scene)]
     for name, (of_object, of_scene) in extents.items():
         if of_object > least[0] and of_scene > least[1]:
             found.append(Estimate(name, of_scene / of_object, True))

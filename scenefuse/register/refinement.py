@@ -35,17 +35,14 @@ from scenefuse.register.score import (
 )
 from scenefuse.register.uncertainty import Uncertainty, common_error, with_bending
 
-# Points kept of either cloud; query points of the first refinement and ranking, and of the polish.
+# Points kept of either cloud; the polish queries a quarter of them.
 FINE_POINTS = 12000
-POLISH_QUERY_POINTS = 3000
 # First pairing distance, as a share of the diagonal: of poses that differ by less, one finds the other.
 START_FRACTION = DISTINCT_SHIFT
 # Hypotheses that are polished, and copies of the best that are.
 POLISHED_POSES = 4
 # Copies count as the best of their surroundings only: nearer ones would slide back to the pose that they are made of.
 COPY_SEPARATION_DEG = 25
-# Its repetition is looked for at this spacing at most, as a share of the object's own diagonal.
-REPETITION_SPACING = 0.005
 # The coarse search stays inside the scale prior; what it found at a bound may go on by this much (natural logarithm).
 PRIOR_SLACK_LOG = 0.15
 # The score is too coarse to choose between two poses in one valley; below this share, one is another's rival.
@@ -53,9 +50,6 @@ MIN_SCORE_RATIO = 0.9
 # A refined pose beyond the alignment's uncertainty, which does not know how the models are bent, is near up to so many
 # times that.
 MAX_BENDING_FACTOR = 2.0
-
-# The mirror image of an object, across its y-z plane.
-MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -133,7 +127,7 @@ def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
             with_queries(with_grid(obj, cell / scale, reach / scale), QUERY_POINTS, seed),
             with_queries(with_grid(scene, cell, reach), QUERY_POINTS, seed),
         ),
-        (with_queries(obj, POLISH_QUERY_POINTS, seed), with_queries(scene, POLISH_QUERY_POINTS, seed)),
+        (with_queries(obj, FINE_POINTS // 4, seed), with_queries(scene, FINE_POINTS // 4, seed)),
         _shifts(problem, obj, fraction * diagonal / scale),
     )
 
@@ -141,7 +135,8 @@ def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
 def _shifts(problem: Problem, obj: Surface, spacing: float) -> list[Array]:
     """The shifts (3,) by which the object, thinned to a spacing, repeats itself; the scale may be wrong yet, and the
     spacing too large to tell."""
-    own = REPETITION_SPACING * problem.object.diagonal
+    # Fine enough at any scale: a quarter of the distance within which points agree, on the object's own diagonal.
+    own = SCORE_FRACTION / 4 * problem.object.diagonal
     if own < spacing:
         obj, spacing = prepare(problem.object, own, problem.seed, FINE_POINTS), own
     return shifts_onto_itself(with_queries(obj, QUERY_POINTS, problem.seed), spacing)
@@ -214,7 +209,7 @@ class _Work:
         Axes that are left-handed make an object its mirror image; one that is nearly symmetric fits that way too.
         """
         ups, (searched, scene), (scored, _) = self.problem.known.ups, self.searched, self.scored
-        known = replace(self.problem.known, ups=None if ups is None else (ups[0] * MIRROR, ups[1]))
+        known = replace(self.problem.known, ups=None if ups is None else (_flipped(ups[0]), ups[1]))
         obj, few, more = (_mirrored(surface) for surface in (self.obj, searched, scored))
         image = replace(
             self,
@@ -222,12 +217,12 @@ class _Work:
             obj=obj,
             searched=(few, scene),
             scored=(more, self.scored[1]),
-            shifts=[shift * MIRROR for shift in self.shifts],
+            shifts=[_flipped(shift) for shift in self.shifts],
         )
         found = []
         for axis in np.linalg.svd(self.obj.points - self.centre, full_matrices=False)[2]:
             # The mirror image across this plane, laid on the object.
-            rotation = pose.rotation @ (np.eye(3) - 2 * np.outer(axis, axis)) @ np.diag(MIRROR)
+            rotation = pose.rotation @ _flipped(np.eye(3) - 2 * np.outer(axis, axis))
             shift = 2 * pose.scale * pose.rotation @ axis * (axis @ self.centre)
             start = Sim3(pose.scale, rotation, pose.translation + shift)
             found.append(image.refine(start, "mirrored"))
@@ -291,10 +286,17 @@ class _Work:
         return score(*surfaces, pose, tau, self.problem.scales.centre, self.problem.known.free_space)
 
 
+def _flipped(vectors: Array) -> Array:
+    """Vectors (..., 3) mirrored across the y-z plane."""
+    return vectors * [-1.0, 1.0, 1.0]
+
+
 def _mirrored(surface: Surface) -> Surface:
     """The mirror image of a surface."""
-    points = surface.points * MIRROR
-    return replace(surface, points=points, normals=surface.normals * MIRROR, tree=cKDTree(points), grid=None, slopes=[])
+    points = _flipped(surface.points)
+    return replace(
+        surface, points=points, normals=_flipped(surface.normals), tree=cKDTree(points), grid=None, slopes=[]
+    )
 
 
 def _refuted(h: Hypothesis) -> bool:

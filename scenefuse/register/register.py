@@ -24,12 +24,11 @@ from scenefuse.register.fine import pose_quantities
 from scenefuse.register.places import likely_places
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, estimates, prior
 from scenefuse.register.refinement import Outcome, refine_hypotheses
+from scenefuse.register.score import DISTINCT_SHIFT
 from scenefuse.register.uncertainty import uncertainty_quantities
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
 SEARCHED_POINTS = 500_000
-# Places this far from each other, over the object's diagonal, are different.
-MIN_DISTANCE = 0.4
 Direction = tuple[float, float, float]
 
 
@@ -213,7 +212,7 @@ def find_in_scene(
         StageError: as of `register_clouds`.
     """
     tried = [(_registered(obj, scene, settings, seed, ups, scales, unit), scene)]
-    for rows in likely_places(obj, scene, up_in_scene, settings.crop, seed):
+    for rows in likely_places(obj, scene, up_in_scene, settings.crop, seed, settings.coarse.keep):
         with contextlib.suppress(StageError):  # too few different points there
             tried.append((_registered(obj, scene[rows], settings, seed, ups, scales, unit), scene[rows]))
     found, part = max(tried, key=lambda one: (one[0].registered, one[0].total))
@@ -238,7 +237,7 @@ def _unless_elsewhere(
         other
         for other in others
         if other.scene_from_object is not None
-        and np.linalg.norm(other.scene_from_object.apply(middle) - pose.apply(middle)) > MIN_DISTANCE * size
+        and np.linalg.norm(other.scene_from_object.apply(middle) - pose.apply(middle)) > DISTINCT_SHIFT * size
     ]
     rival = max(elsewhere, key=lambda other: other.total, default=None)
     if rival is None or rival.scene_from_object is None:

@@ -13,8 +13,8 @@ from scenefuse.geometry.surface import Pairs, Surface, pair
 RECALL_WEIGHT = 2.0
 # Distance within which points agree, as a share of the scene crop's diagonal.
 SCORE_FRACTION = 0.02
-# Colours that vary less (standard deviation, 0..1) say nothing about the pose.
-MIN_CONTRAST = 0.02
+# Noise of colours (standard deviation, 0..1) at least; those that vary less say nothing about the pose.
+MIN_COLOR_NOISE = 0.03
 # Poses that differ by less than these are one: an angle, the scale, the centre as a share of the diagonal.
 DISTINCT_ANGLE_DEG, DISTINCT_SCALE_LOG, DISTINCT_SHIFT = 8.0, 0.06, 0.05
 
@@ -98,7 +98,7 @@ def color_agreement(obj: Surface, scene: Surface, pairs: Pairs) -> float | None:
     """
     if obj.colors is None or scene.colors is None:
         return None
-    if min(float(c.std(0).max()) for c in (obj.colors, scene.colors)) < MIN_CONTRAST:
+    if min(float(c.std(0).max()) for c in (obj.colors, scene.colors)) < MIN_COLOR_NOISE:
         return None
     if len(pairs.distance) < 30:
         return 0.0

@@ -199,7 +199,8 @@ RULES = [
     # Candidates.
     Rule("coarse: sweep of headings", f"{R}.coarse._upright", nothing),
     Rule("coarse: features", f"{R}.coarse._from_features", nothing),
-    Rule("RANSAC: edges agree on one scale", f"{R}.coarse.MIN_EDGE_RATIO", constant(0.0)),
+    Rule("RANSAC: edges agree on one scale", f"{R}.coarse.triples_of_one_scale",
+         lambda f: lambda *known: f(*known, 0.0)),
     Rule("sweep: blurred target", f"{R}.coarse._blur", same),
     Rule("coarse: brief refinement", f"{R}.coarse.BRIEF_ROUNDS", constant(1)),
     # Refinement.

@@ -19,7 +19,7 @@ from scenefuse.fuse import measure, modes
 from scenefuse.fuse.modes import FusionSettings
 from scenefuse.fuse.write import together
 from scenefuse.geometry import photo_check, photo_kernel
-from scenefuse.geometry.photo_check import Matches, Photos, moved_photos, read_photos
+from scenefuse.geometry.photo_check import Matches, Photos, moved_photos, pack, read_photos
 from scenefuse.photos.workspace import read_workspace
 
 RESULTS = Path(os.environ.get("RESULTS", "results"))
@@ -55,7 +55,7 @@ RULES = [
     Rule("settling", "scenefuse.fuse.modes.settle", lambda f: lambda *_: None),
     Rule("the more certain one of both poses", f"{SETTLE}.MIN_MISPLACED", constant(0.0)),
     Rule("the scale settles where it is certain", f"{SETTLE}.MAX_SPREAD", constant(0.0)),
-    Rule("photos of half the size", f"{CHECK}.HALVINGS", constant(0)),
+    Rule("photos of half the size", f"{CHECK}.halved", lambda _: lambda photos: pack([])),
     Rule("a deviation of 1.2 pixels at most", f"{CHECK}.MAX_DEVIATION_PX", constant(np.inf)),
     Rule("no other offset is better", f"{CHECK}.MAX_DROP", constant(9.0)),
     Rule("other references", f"{KERNEL}.REFERENCES", constant(1)),
