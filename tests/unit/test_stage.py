@@ -16,6 +16,7 @@ from scenefuse.core.stage import (
     manifest,
     quantity,
     read_json,
+    remove_leftovers,
     run,
     write_json,
 )
@@ -180,3 +181,13 @@ def test_a_lack_of_memory_is_one_sentence_however_a_library_says_it(monkeypatch,
     with pytest.raises(SystemExit, match="1"):
         run(stage)
     assert "is too small; raise the limit, end other programs, or use fewer pixels" in capsys.readouterr().err
+
+
+def test_what_killed_processes_left_beside_an_output_is_removed_and_nothing_else(tmp_path):
+    no_process = 2**30
+    for name in (f".a.tmp-{no_process}.db", f".a.tmp-{no_process}.db-wal", ".a.tmp-1.db", f".ab.tmp-{no_process}.db"):
+        (tmp_path / name).touch()
+    (tmp_path / f".maps.tmp-{no_process}").mkdir()
+    for output in ("a.db", "maps", "gone/b.json"):
+        remove_leftovers(tmp_path / output)
+    assert {path.name for path in tmp_path.iterdir()} == {".a.tmp-1.db", f".ab.tmp-{no_process}.db"}
