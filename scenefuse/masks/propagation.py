@@ -39,8 +39,8 @@ from scenefuse.photos.workspace import View, Workspace
 
 # Weight of a mask's quality beside its agreement, when one of several is chosen.
 QUALITY_WEIGHT = 0.3
-# For several clicks alone, where no mask has this quality, the largest is taken of those that score less by no more
-# than this: who clicks on several parts means the whole.
+# With only several clicks, and no mask of this quality, the largest mask is taken whose score is within this margin:
+# whoever clicks several parts means the whole.
 CERTAIN_QUALITY, SCORE_MARGIN = 0.9, 0.06
 
 NO_CLICKS = PhotoClicks()
@@ -80,8 +80,8 @@ def propagate(
 
     Photos with three clicks or a box come first, those with most clicks before. Then always the photo that sees most
     points known to be the object's, so that the masks go round the object both ways; one with clicks is prompted by
-    these too. A mask that contradicts what prompted it does not vote. All that do not, or that the others contradict in
-    the end, are made once more from the votes of all others; but no other photo overrules three clicks or a box.
+    these too. A mask that contradicts what prompted it does not vote. Masks that do not vote, or that the others
+    contradict in the end, are made once more from the others' votes; three clicks or a box are never overruled.
 
     Args:
         segment: SAM 2 or GrabCut.
@@ -107,7 +107,7 @@ def propagate(
             make(following)
 
     make_all()
-    if not any(voter.votes for voter in made.values()):
+    if not any(voter.can_vote for voter in made.values()):
         best = max(made, key=lambda k: made[k].agreement)
         if made[best].agreement <= 0:
             _refuse(photos, made, left_out)
@@ -119,7 +119,7 @@ def propagate(
         make_all()
     for k in range(len(photos.views)):
         others = {row: voter for row, voter in made.items() if row != k}
-        settled = k in made and made[k].votes and agrees_with_others(photos, k, made[k].mask, others, measure)
+        settled = k in made and made[k].can_vote and agrees_with_others(photos, k, made[k].mask, others, measure)
         if not settled and not (k in made and made[k].final):
             make(k, " again")
     for k, voter in made.items():
@@ -214,7 +214,7 @@ def best_mask(
     tolerance_px: float,
     measure: Measure = agreement,
 ) -> tuple[Mask, float, float]:
-    """The best of the masks for prompts, without the parts of it that hold none, with clicked parts that prompt alone.
+    """The best mask for prompts: without parts that hold none, with clicked parts that it lacks.
 
     A mask that agrees with more clicks is better, whatever its quality. For several clicks alone the largest of those
     about as good is taken, if the segmenter is certain of none.
@@ -279,12 +279,12 @@ def _propagated(photos: Workspace, made: dict[int, Voter], left_out: list[str], 
     """Masks that vote, empty ones for the other photos, and what they say of each point seen in three photos."""
     reasons, masks = {}, []
     for k, view in enumerate(photos.views):
-        masks.append(made[k].mask if made[k].votes else np.zeros((view.height, view.width), dtype=bool))
-        if not made[k].votes:
+        masks.append(made[k].mask if made[k].can_vote else np.zeros((view.height, view.width), dtype=bool))
+        if not made[k].can_vote:
             reasons[view.name] = (
-                f"the mask from the clicks agrees with {made[k].agreement:.2f} of its prompts (least {MIN_AGREEMENT})"
+                f"the mask's agreement with its prompts is {made[k].agreement:.2f}, at least {MIN_AGREEMENT} is needed"
             )
-    rows = [voter.rows for voter in made.values() if voter.votes]
+    rows = [voter.rows for voter in made.values() if voter.can_vote]
     kind = known_points(photos, made)
     counts = np.bincount(np.concatenate(rows), minlength=len(kind))
     kind[counts < min(CONFIRMING_PHOTOS, len(rows))] = 0

@@ -101,7 +101,7 @@ def target_from_votes(
 ) -> Target:
     """Where the object is, by the sparse points that the photos' masks vote for, those whose kind (P,) is 1.
 
-    What these points do not decide is decided as in `target_from_points`, whose other arguments they are: a vote
+    Points that the votes leave open are classified as in `target_from_points`, from the points voted for: a vote
     against a point says less, as a part of the object that one mask lacks is missing from the next ones too.
 
     Raises:

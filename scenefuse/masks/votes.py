@@ -47,14 +47,14 @@ class Voter:
     only: bool = False
 
     @property
-    def votes(self) -> bool:
+    def can_vote(self) -> bool:
         """Whether it counts."""
         return self.quality > 0 and (self.only or self.agreement >= MIN_AGREEMENT)
 
     @property
     def final(self) -> bool:
         """Whether it is what a person clicked, which no other photo overrules."""
-        return self.votes and self.clicks.enough
+        return self.can_vote and self.clicks.enough
 
 
 def voter_of(photos: Workspace, k: int, mask: Mask, quality: float, agreement: float, clicks: PhotoClicks) -> Voter:
@@ -83,7 +83,7 @@ def vote_shares(photos: Workspace, made: dict[int, Voter]) -> Array:
     """(P,) share of the votes that are for the object, per sparse point, weighted by quality; NaN without votes."""
     votes, total = np.zeros(len(photos.points)), np.zeros(len(photos.points))
     for voter in made.values():
-        if voter.votes:
+        if voter.can_vote:
             np.add.at(total, voter.rows, voter.quality)
             np.add.at(votes, voter.rows, voter.quality * voter.inside)
     with np.errstate(invalid="ignore"):
@@ -100,7 +100,7 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> NDArray[np.int8]:
     """
     share = vote_shares(photos, made)
     known = np.where(share >= MIN_AGREEMENT, 1, np.where(share <= 1 - MIN_AGREEMENT, -1, 0)).astype(np.int8)
-    rows = [voter.rows for voter in made.values() if voter.votes]
+    rows = [voter.rows for voter in made.values() if voter.can_vote]
     counts = np.bincount(np.concatenate([np.zeros(0, np.int64), *rows]), minlength=len(known))
     own = without_outermost(photos.points[(known > 0) & (counts >= CONFIRMING_PHOTOS)])
     if len(own) >= MIN_OBJECT_POINTS:
@@ -109,7 +109,7 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> NDArray[np.int8]:
     by_stereo = np.arange(len(known)) >= len(known) - photos.by_stereo
     known[by_stereo & (known < 0)] = 0
     for voter in made.values():
-        for near in voter.denied if voter.votes else []:
+        for near in voter.denied if voter.can_vote else []:
             known[near] = -1
     return known
 
@@ -119,7 +119,7 @@ def known_pixels(photos: Workspace, k: int, others: dict[int, Voter]) -> Prompts
     this photo, too, at the nearest of its points that this photo sees."""
     kind, at = known_points(photos, others)[photos.seen[k]], photos.seen_at[k]
     place = dict(zip(photos.seen[k].tolist(), at))
-    denied = (near for voter in others.values() if voter.votes for near in voter.denied)
+    denied = (near for voter in others.values() if voter.can_vote for near in voter.denied)
     off = [next((place[row] for row in near.tolist() if row in place), None) for near in denied]
     clicked_off = np.array([pixel for pixel in off if pixel is not None]).reshape(-1, 2)
     return Prompts(clicked_off=clicked_off, known=at[kind > 0], known_off=at[kind < 0])

@@ -25,7 +25,7 @@ DEPTH_JUMP = 0.03
 MIN_OPACITY = 0.9
 # Pixels nearer to black are mostly noise, and nearer to white mostly clipped.
 COLOR_MARGIN = 0.03
-# A photo that was not trained on is taken to have the gains of so many that were taken nearest to it.
+# A photo that was not trained on gets the mean gains of this many nearest training photos.
 GAIN_NEIGHBOURS = 2
 # Sharpness compares details finer than a Gaussian's sigma of one pixel with those between it and this one.
 COARSE_PX = 3.0
@@ -193,7 +193,7 @@ def fitted_log_gain(rendered: Tensor, photo: Tensor) -> Tensor:
 
 
 def gains_nearby(log_gain: Tensor, center: Tensor, trained: Tensor) -> Tensor:
-    """Log gains (V, 3) of all photos: of those trained on their own, of others the mean of the nearest ones'.
+    """Log gains (V, 3) of all photos: for training photos their own, for others the mean of the nearest ones.
 
     Args:
         log_gain: (T, 3) of the photos trained on.

@@ -14,7 +14,7 @@ RING_PX = 12
 OUTSIDE_SHARE = 0.1
 # Samples and depths of one surface lie this near each other along a ray, as a share of the cube's side.
 SURFACE_DEPTH = 0.05
-# A mask that the ignored band would leave less than this share of is drawn from as a whole: it is thin everywhere.
+# Where the ignored band would leave less than this share of a mask, all of it is drawn from: it is thin everywhere.
 THIN_SHARE = 0.2
 
 
@@ -31,8 +31,8 @@ class PhotoTensors:
         center: (V, 3) float32 camera centres.
         depths: (V, H, W) float32 prior depth along z in nerf units, 0 where there is none.
         confidence: (V, H, W) float32 in 0..1, weight of the prior.
-        hidden: (V, H, W) bool, pixels beside the object that do not say that nothing is there, since something stands
-            before it; None for none.
+        hidden: (V, H, W) bool, pixels off the mask where something in front may hide the object, which are no proof of
+            emptiness; None for none.
     """
 
     images: Tensor
@@ -76,7 +76,7 @@ class PixelPool:
 
 
 @dataclass(frozen=True)
-class RayBatch:
+class PixelBatch:
     """Rays of one step, image after image.
 
     Attributes:
@@ -97,9 +97,9 @@ class RayBatch:
     depth: Tensor
     confidence: Tensor
 
-    def to(self, device: torch.device) -> "RayBatch":
+    def to(self, device: torch.device) -> "PixelBatch":
         """The same on a device."""
-        return RayBatch(**{name: part.to(device) for name, part in vars(self).items()})
+        return PixelBatch(**{name: part.to(device) for name, part in vars(self).items()})
 
 
 def dilate(masks: Tensor, radius_px: int) -> Tensor:
@@ -137,7 +137,7 @@ def _flatten(masks: Tensor) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     return pixels.astype(np.int32), np.searchsorted(views, np.arange(len(masks) + 1))
 
 
-def draw_batch(photos: PhotoTensors, pool: PixelPool, seed: int, step: int, images: int, rays: int) -> RayBatch:
+def draw_batch(photos: PhotoTensors, pool: PixelPool, seed: int, step: int, images: int, rays: int) -> PixelBatch:
     """Draw `rays` pixels in each of `images` photos; the same seed and step give the same batch.
 
     Args:
@@ -156,7 +156,7 @@ def draw_batch(photos: PhotoTensors, pool: PixelPool, seed: int, step: int, imag
     view = torch.from_numpy(np.repeat(order, rays))
     width = photos.images.shape[2]
     down, across = flat // width, flat % width
-    return RayBatch(
+    return PixelBatch(
         view,
         torch.stack([across + 0.5, down + 0.5], dim=1).float(),
         torch.from_numpy(inside.reshape(-1)),

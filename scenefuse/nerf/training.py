@@ -27,7 +27,7 @@ from scenefuse.nerf import losses
 from scenefuse.nerf.appearance import Appearance, find_appearance, squared_radius
 from scenefuse.nerf.field import Field, FieldSettings, coarse_to_fine
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.rays import SURFACE_DEPTH, PhotoTensors, PixelPool, RayBatch, camera_rays, draw_batch, pixel_pool
+from scenefuse.nerf.rays import SURFACE_DEPTH, PhotoTensors, PixelBatch, PixelPool, camera_rays, draw_batch, pixel_pool
 from scenefuse.nerf.render import UNIFORM_SHARE, Composited, Occupancy, RayPrior, RaySamples, composite, march, updated
 
 # Steps between updates of the grid (Mueller et al. 2022, appendix E.2).
@@ -145,7 +145,7 @@ class Rendered:
     """
 
     step: int
-    batch: RayBatch
+    batch: PixelBatch
     rays: Rays
     drawn: RaySamples
     sigma: Tensor
@@ -277,7 +277,7 @@ def _prepare(nerf: Nerf, training: Training, step: int) -> None:
         nerf.appearance = find_appearance(nerf.field, nerf.occupancy, training.photos, training.recipe.samples)
 
 
-def _draw(training: Training, pool: PixelPool, step: int, device: torch.device) -> RayBatch:
+def _draw(training: Training, pool: PixelPool, step: int, device: torch.device) -> PixelBatch:
     recipe = training.recipe
     batch = draw_batch(training.photos, pool, training.seed, step, recipe.images_per_batch, recipe.rays_per_image)
     return batch.to(device)
@@ -301,7 +301,7 @@ def _descend(
     optimizer.zero_grad(set_to_none=True)
 
 
-def _loss_terms(nerf: Nerf, training: Training, batch: RayBatch, step: int) -> tuple[dict[str, Tensor], int]:
+def _loss_terms(nerf: Nerf, training: Training, batch: PixelBatch, step: int) -> tuple[dict[str, Tensor], int]:
     """Loss terms of a batch and `psnr` in dB inside the masks, by name, each a scalar; and the number of samples."""
     rays = _rays(training.photos, batch, training.recipe.prior_share)
     device = rays.origin.device
@@ -320,7 +320,7 @@ def _loss_terms(nerf: Nerf, training: Training, batch: RayBatch, step: int) -> t
     return terms | {"psnr": psnr}, drawn.t.numel()
 
 
-def _rays(photos: PhotoTensors, batch: RayBatch, prior_share: float) -> Rays:
+def _rays(photos: PhotoTensors, batch: PixelBatch, prior_share: float) -> Rays:
     """The batch's rays, and where their prior lies."""
     device = batch.view.device
     intrinsics, rotation, center = (
