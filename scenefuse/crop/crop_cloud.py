@@ -16,9 +16,11 @@ from scenefuse.geometry.ground import Ground, fit_ground
 
 # The box is widened, beside `margin`, by two pairing distances of the registration: a share of its diagonal.
 MARGIN_FRACTION = 0.04
-# Points closer than this belong to one part, as a share of the diagonal of the marks' box. A part this near to a mark
-# belongs to the object, and this near beside a mark that is below the surface nothing is ground.
-REACH_FRACTION = 0.03
+# A part this near to a fiducial belongs to the object, and this near beside one that is below the surface nothing is
+# ground; as a share of the diagonal.
+REACH_FRACTION = 0.05
+# Points closer than this belong to one part, as a share of the diagonal of the fiducials' box.
+LINK_FRACTION = 0.03
 # A step is left out if less than this share of the points in the box would be left: the object is there.
 MIN_LEFT = 0.05
 # Parts with a smaller share of the points are left out.
@@ -145,7 +147,7 @@ def _without_loose_parts(
     rows = np.flatnonzero(inside)
     if not len(rows):
         return inside, []
-    link = max(REACH_FRACTION * diagonal, 3 * spacing(points[rows]))
+    link = max(LINK_FRACTION * diagonal, 3 * spacing(points[rows]))
     near = _parts_near(points[rows], marks, link, REACH_FRACTION * diagonal)
     if not near.any():
         return inside, ["no part in the box lies near a fiducial: all of them were kept"]
@@ -237,7 +239,7 @@ def on_ground(points: Array, marks: Array, ground: Ground, in_box: NDArray[np.bo
     around = ~in_box[rows] & (z >= surface - ground.tolerance)[level]
     found = np.zeros(len(points), dtype=bool)
     if around.any():
-        part_of, counts = parts(points[rows], max(REACH_FRACTION * diagonal, 3 * spacing(points[rows])))
+        part_of, counts = parts(points[rows], max(LINK_FRACTION * diagonal, 3 * spacing(points[rows])))
         continued = np.bincount(part_of, around, len(counts)) >= MIN_PART_SHARE * around.sum()
         found[rows] = continued[part_of]
     return found & in_box

@@ -12,8 +12,8 @@ from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.crop.crop_cloud import (
+    LINK_FRACTION,
     MIN_PART_SHARE,
-    REACH_FRACTION,
     STRAY_SHARE,
     Crop,
     CropSettings,
@@ -75,7 +75,7 @@ class SceneClicks:
             around = points[np.argsort(np.linalg.norm(points - click, axis=1), kind="stable")[:PLANE_POINTS]]
             spread, axes = np.linalg.eigh(np.cov(around.T))
             if spread[0] < MAX_VARIATION * spread.sum():
-                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < REACH_FRACTION * extent
+                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < LINK_FRACTION * extent
             found |= own
         return found
 
