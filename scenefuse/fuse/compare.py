@@ -41,8 +41,8 @@ THROUGH_PHOTOS, THROUGH_SHARE = 2, 0.3
 # Points of both sides show the same place within so many of their common standard deviations, or so many spacings of
 # the sparser side where that is more; never farther than twice the RESOLUTION.
 SAME_PLACE_DEVIATIONS, SAME_PLACE_SPACINGS = 5.0, 1.5
-# The object's points give way where the scene's standard deviation is smaller by more than this factor: they are the
-# denser ones, and equals would alternate. Where they are outnumbered, the scene's give way likewise.
+# The object's points give way where the scene's standard deviation is smaller by more than this factor: the
+# object's cloud is usually denser, so it wins ties; where the scene's is denser, the scene wins.
 BETTER_FACTOR = 1.5
 # Points of the scene for each of the object's, on the surface that both have, from which the scene is the denser.
 DENSER_FACTOR = 2.0
@@ -70,8 +70,8 @@ class Compared:
 def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.0) -> Compared:
     """Decide which points of both sides stay.
 
-    Measured points are the surface that hides and is seen. What the scene measured goes only where something is left
-    beside it.
+    Measured points count as real surface, which hides what is behind it. A measured point of the scene is removed only
+    if another point remains beside it.
 
     Args:
         obj: the object where it settled in the scene.
@@ -165,7 +165,7 @@ def _alone(points: Array, others: Cloud, reach: float) -> Mask:
 def _times_as_many(points: Array, others: Array, reach: float) -> float:
     """How many of (N, 3) points there are for each of the others (M, 3), where both are within `reach` of each other.
 
-    Counted, since regular points lie farther from their nearest ones than as many irregular ones; doubles are one.
+    Counted, not taken from spacings: regular points lie farther apart than as many irregular ones. Doubles are one.
     """
     if not len(points):
         return 0.0
@@ -184,8 +184,8 @@ def _beside(points: Array, partners: Cloud) -> Array:
 def _rougher(one: Cloud, two: Cloud, side: float) -> tuple[Array, Array]:
     """How much more each of two clouds scatters about planes than the other does there, for its points (N,), (M,).
 
-    A standard deviation, by cells of a side, those of points that face the same way apart from the others. What is bent
-    or has an edge scatters in both alike.
+    A standard deviation, per cubic cell, separately for each of six facing directions. What is bent or has an
+    edge scatters in both alike.
     """
     keys = [_cells_by_side(cloud, one.points.min(0), side) for cloud in (one, two)]
     group = np.unique(np.concatenate(keys), axis=0, return_inverse=True)[1].reshape(-1)

@@ -26,7 +26,8 @@ class Evidence(IntEnum):
 
 
 FIELDS = ("photos", "match", "deviation", "world_deviation", "evidence")
-"""What is known of a point: photos that confirm it, mean NCC of the best, one standard deviation, and one of these."""
+"""What is known of a point: photos that confirm it, mean NCC of the best, standard deviations on the object and in the
+world, and an Evidence value."""
 # Share of the object's diagonal that fusion resolves: how far a point lies before or behind a surface to be seen
 # through or hidden, what its neighbours are, and the side of the cells in which missing surface is counted.
 RESOLUTION = 0.01

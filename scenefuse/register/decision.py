@@ -25,8 +25,8 @@ from scenefuse.register.uncertainty import Uncertainty
 
 DecidedBy = Literal["geometry", "near", "photos", "both"]
 
-# The gate's further thresholds; right poses of the planted trials pass them with room to spare. The share of the scene
-# crop that the object explains.
+# Fixed thresholds of the gate, which right poses of the planted trials pass with room to spare; FineSettings has those
+# that can be set. Least share of the scene crop that the object explains.
 MIN_RECALL = 0.4
 # The agreement of the colours, where both clouds have colours that vary.
 MIN_COLOR = 0.5
@@ -84,9 +84,9 @@ class Decision:
     Attributes:
         registered: whether the pose may be used.
         reason: one sentence why.
-        decided_by: `geometry`, `near` (that, near an alignment whose own pose the scene's photos refute), `photos` (the
-            alignment from shared features replaced the clouds' pose) or `both` (they agree).
-        margin: relative lead over the best rival, 0..1.
+        decided_by: `geometry`, `near` (the clouds' pose, close to an alignment that the scene's photos rule out),
+            `photos` (the alignment from shared features replaced the clouds' pose) or `both` (they agree).
+        margin: relative lead over the best rival, at most 1; negative where the rival is better.
         rival: the best pose that differs and would leave the object elsewhere, or None.
         free_axis: unit vector (3,) in the scene about which the object can turn and stay the same, or None.
     """
@@ -110,7 +110,7 @@ def decide(
 ) -> Decision:
     """Compare the best hypothesis with its rivals and with the gate.
 
-    A rival that turns the object onto itself, in shape and colour, is no rival: fused, both give the same points.
+    A pose that only turns the object onto itself, in shape and colour, is no rival: fused, both give the same points.
     Shared photos settle which pose is meant, so that rivals, colours and scores no longer matter: the scene may lack
     nearly all of the object, or show much beside it. Free space, gravity and the pose's own uncertainty still count:
     `registered` means the same tolerances whatever decided.
@@ -143,7 +143,7 @@ def decide(
     return Decision(reason is None, reason or words, decided_by, margin, rival, free_axis)
 
 
-def unless_torn(decision: Decision, with_bending: Uncertainty | None, diagonal: float) -> Decision:
+def unless_bent(decision: Decision, with_bending: Uncertainty | None, diagonal: float) -> Decision:
     """The decision, or a refusal where the object's own model may be bent too far.
 
     Args:
@@ -234,16 +234,14 @@ def _reasons_of_clouds(
         yield f"the colours agree by {found.color:.2f} only, below {MIN_COLOR:.2f}"
     if repetition.undecided is not None:
         yield (
-            f"the object repeats itself every {repetition.undecided:.3g} units of the scene, and shifted along itself"
-            " it fits what both show as well; cut the scene to where the object ends, or register it by photos"
+            f"the object repeats itself every {repetition.undecided:.3g} units of the scene, and shifted by that"
+            " much it fits equally well; cut the scene to where the object ends, or register it by photos"
         )
     if margin < settings.min_margin:
         yield f"another pose is nearly as good: the margin is {margin:.3f}, below {settings.min_margin:.3f}"
     if scales.at_edge(best.pose.scale):
-        yield (
-            f"the scale {best.pose.scale:.4g} lies at the edge of its prior, {scales.centre:.4g} times or over"
-            f" {np.exp(scales.width):.2f}; widen the prior"
-        )
+        low, high = scales.centre * np.exp([-scales.width, scales.width])
+        yield f"the scale {best.pose.scale:.4g} lies at the edge of what was searched, {low:.4g} to {high:.4g}"
 
 
 def _reasons_of_spread(

@@ -92,7 +92,7 @@ def register_finely(
     problem = Problem(obj, scene, scales, constraints, seed)
     outcome = refine_hypotheses(problem, read_candidates(coarse_json), settings)
     bending = known.bending(outcome.ranked[0].pose, obj.points.mean(0))
-    outcome = outcome.unless_torn(bending[0], scene.diagonal)
+    outcome = outcome.unless_bent(bending[0], scene.diagonal)
     seconds = time.perf_counter() - start
     if picture is not None:
         draw_alignment(picture, obj, scene, outcome.ranked[0].pose, seed)

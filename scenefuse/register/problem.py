@@ -76,7 +76,7 @@ class Alignment:
     uncertainty: Uncertainty
 
     def agrees(self, pose: Sim3, centre: Array, diagonal: float, times: float = 1.0) -> bool:
-        """Whether a pose lies within `times` three standard deviations, or 3 %, 3 degrees and 3 % of the diagonal."""
+        """Whether a pose lies within `times` three standard deviations; at least 3 %, 3 degrees, 3 % of the size."""
         scale = abs(np.log(pose.scale / self.pose.scale))
         angle = rotation_angle_deg(pose.rotation @ self.pose.rotation.T)
         shift = float(np.linalg.norm(pose.apply(centre) - self.pose.apply(centre)))
@@ -196,8 +196,8 @@ def estimates(obj: Cloud, scene: Cloud, ups: tuple[Array, Array] | None) -> list
     """Every estimate of the scale; the paper's whole-cloud RMS ratio comes first.
 
     Gravity adds two: the footprint (root of the area of the horizontal convex hull, which a flight sees whole)
-    and the height. Voxels as wide as points may lie apart even out the density first, except for the paper's. What is
-    flat on either side, to 1 % of the diagonal, gives no estimate.
+    and the height. First both clouds are thinned to a point a voxel, so that density does not count, except for the
+    paper's. What is flat on either side, to 1 % of the diagonal, gives no estimate.
     """
     even_obj, even_scene = (voxel_downsample(c, SCORE_FRACTION * c.diagonal).points for c in (obj, scene))
     found = [

@@ -18,8 +18,8 @@ from scenefuse.register.decision import (
     FineSettings,
     Repetition,
     decide,
+    unless_bent,
     unless_mirrored,
-    unless_torn,
 )
 from scenefuse.register.likelihood import certified
 from scenefuse.register.problem import Problem
@@ -76,12 +76,12 @@ class Outcome:
             return self.uncertainty
         return Uncertainty.of(self.uncertainty.covariance + self.common_error)
 
-    def unless_torn(self, bending: Array | None, diagonal: float) -> "Outcome":
-        """Refused where the object's model may be bent too far, by its covariance (7, 7); see `unless_torn`."""
+    def unless_bent(self, bending: Array | None, diagonal: float) -> "Outcome":
+        """Refused where the object's model may be bent too far, by its covariance (7, 7); see `unless_bent`."""
         if self.uncertainty is None or bending is None:
             return self
         bent = with_bending(self.uncertainty, self.ranked[0].pose, bending, None)
-        return replace(self, decision=unless_torn(self.decision, bent, diagonal))
+        return replace(self, decision=unless_bent(self.decision, bent, diagonal))
 
 
 def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], settings: FineSettings) -> Outcome:

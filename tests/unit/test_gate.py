@@ -18,7 +18,7 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import Surface
 from scenefuse.register import decision as gate
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
-from scenefuse.register.decision import Decision, FineSettings, Repetition, decide, unless_mirrored, unless_torn
+from scenefuse.register.decision import Decision, FineSettings, Repetition, decide, unless_bent, unless_mirrored
 from scenefuse.register.problem import Alignment, Constraints, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.score import DISTINCT_ANGLE_DEG, DISTINCT_SCALE_LOG, DISTINCT_SHIFT, Hypothesis, Score
@@ -236,11 +236,11 @@ def check_torn() -> None:
     """A model that may be bent beyond use is refused, and nothing else changes."""
     good = Decision(True, "good", "photos", 1.0, None, None)
     bent = [Uncertainty.even(0, 0, gate.MAX_BENDING * DIAGONAL * factor) for factor in (0.999, 1.001)]
-    assert unless_torn(good, None, DIAGONAL) is good and unless_torn(good, bent[0], DIAGONAL) is good
-    torn = unless_torn(good, bent[1], DIAGONAL)
+    assert unless_bent(good, None, DIAGONAL) is good and unless_bent(good, bent[0], DIAGONAL) is good
+    torn = unless_bent(good, bent[1], DIAGONAL)
     assert not torn.registered and "10% of the diagonal" in torn.reason and "more photos" in torn.reason
     refused = replace(good, registered=False, reason="too little")
-    assert unless_torn(refused, bent[1], DIAGONAL) is refused
+    assert unless_bent(refused, bent[1], DIAGONAL) is refused
 
 
 def check_mirrored() -> None:
