@@ -22,6 +22,8 @@ from scenefuse.geometry.visual_hull import (
 from scenefuse.nerf.rays import SURFACE_DEPTH, dilate
 from scenefuse.photos.workspace import View
 
+# Cells per side of the hull that the cube is fitted to: the margin is wider than one of them.
+FIRST_CELLS = 64
 # Share of the cube's side left free on each side of the hull, for what the masks cut off.
 MARGIN = 0.02
 # Share of the photos that must frame a cell, more than masks need: what few photos bound is large, and costs rays.
@@ -56,7 +58,7 @@ def find_volume(
     try:
         if cube is None:
             rough = _rough_cube([outline.view for outline in outlines], own)
-            cube = tight_cube(visual_hull(outlines, rough, cells // 2, tolerance, own), rough, MARGIN)
+            cube = tight_cube(visual_hull(outlines, rough, FIRST_CELLS, tolerance, own), rough, MARGIN)
         hull = visual_hull(outlines, cube, cells, tolerance, own)
     except ValueError as error:
         raise StageError(f"no volume for the object: {error}; check the masks and the cameras") from None
