@@ -3,6 +3,7 @@
 import argparse
 import inspect
 import os
+import subprocess
 import sys
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -11,7 +12,11 @@ from pathlib import Path
 from scenefuse.core.version import VERSION
 
 ALL = "pip install 'scenefuse[all]'"
-OWN_SETTINGS, SCENES = Path("config/config.yaml"), Path("config/scenes.tsv")
+OWN_SETTINGS, SCENES, REPORT = (
+    Path("config/config.yaml"),
+    Path("config/scenes.tsv"),
+    Path("results/summary/report.html"),
+)
 # Snakemake's options that say how much runs at a time, or that another machine decides it.
 PARALLEL = ("--cores", "-c", "--jobs", "-j", "--profile", "--workflow-profile", "--executor", "-e")
 
@@ -93,23 +98,36 @@ def _export() -> None:
     """make what is handed over of finished objects: surfaces, drawings, cameras"""
     parser = argparse.ArgumentParser(
         prog="scenefuse export",
-        description="Make surfaces, drawings and cameras of finished objects; nothing before them runs again.",
-        epilog="All other options are Snakemake's.",
+        description="Make surfaces, drawings and cameras of finished objects, and show them in the report."
+        " Nothing before them runs again.",
+        epilog="All other options are those of scenefuse run, as -n to see what would be made.",
     )
-    parser.add_argument("--what", nargs="+", choices=EXPORTS, default=list(EXPORTS), help="all of them if not given")
-    parser.add_argument("--object", nargs="+", dest="names", help="names; all finished objects if not given")
+    parser.add_argument("--what", nargs="+", choices=EXPORTS, default=list(EXPORTS), help="default: all of them")
+    parser.add_argument("--object", nargs="+", dest="names", metavar="NAME", help="default: all that are finished")
     words, others = parser.parse_known_args(sys.argv[1:])
     finished = sorted(path.parent.name for path in Path().glob("results/objects/*/fused.ply"))
     missing = [name for name in words.names or () if name not in finished]
     if missing or not finished:
         which = f"object '{missing[0]}' has" if missing else "no object has"
         sys.exit(f"error: {which} a results/objects/NAME/fused.ply here; run the workflow first (scenefuse run)")
-    rules, targets = zip(*(EXPORTS[what] for what in words.what))
-    scenes = [path.parent.name for path in Path().glob("results/scenes/*/dense.ply")]
-    pairs = [(name, scene) for name in words.names or finished for scene in scenes]
-    wanted = {target.format(object=name, scene=scene) for target in targets for name, scene in pairs}
-    sys.argv = [sys.argv[0], *sorted(wanted), *others, "--allowed-rules", *sorted({*rules, "make_surface"})]
-    _run()
+    names = sorted(words.names or finished)
+    scenes = sorted(path.parent.name for path in Path().glob("results/scenes/*/dense.ply"))
+    # Given clouds have no cameras.
+    what = [item for item in words.what if item != "cameras" or any(Path().glob("results/*/*/undistorted"))]
+    targets = {EXPORTS[item].format(object=name, scene=scene) for item in what for name in names for scene in scenes}
+    run = [sys.executable, "-m", "scenefuse", "run"]
+    rules = ["make_surface", "draw_surface", "export_cameras"]
+    ended = subprocess.run([*run, *sorted(targets), *others, "--allowed-rules", *rules]).returncode
+    if ended or {"-n", "--dry-run", "--dryrun"} & set(others):
+        sys.exit(ended)
+    name, scene = ("{" + ",".join(found) + "}" if len(found) > 1 else found[0] for found in (names, scenes))
+    print("Export:", ", ".join(EXPORTS[item].format(object=name, scene=scene) for item in what), flush=True)
+    if REPORT.is_file():
+        # The page shows what was exported.
+        ended = subprocess.run(
+            [*run, str(REPORT), *others, "--quiet", "all", "--allowed-rules", "write_report"]
+        ).returncode
+    sys.exit(ended)
 
 
 def _run() -> None:
@@ -164,11 +182,11 @@ def _complete() -> None:
     run(complete)
 
 
-# The rule of each thing that is handed over, and its target.
+# What is handed over.
 EXPORTS = {
-    "surface": ("make_surface", "results/objects/{object}/surface.json"),
-    "drawings": ("draw_surface", "results/objects/{object}/drawings"),
-    "cameras": ("export_cameras", "results/scenes/{scene}/cameras"),
+    "surface": "results/objects/{object}/surface.glb",
+    "drawings": "results/objects/{object}/drawings",
+    "cameras": "results/scenes/{scene}/cameras",
 }
 PARTS: dict[str, Callable[[], None]] = {
     "complete": _complete,

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
-from scenefuse.core.stage import StageError, read_json
+from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.report.run_summary import ALONE
 from scenefuse.report.values import length, percent, read_table
@@ -78,6 +78,21 @@ def object_facts(row: Row) -> dict[str, str]:
     if "added_points" in has:
         facts["File"] = f"objects/{has['object']}/fused.ply; in the scene: completed.ply"
     return _capital(facts | _next(has))
+
+
+def surface_facts(folder: Path) -> dict[str, str]:
+    """The same of the surface in an object's results; nothing where none was made of its last fusion."""
+    path, fused = folder / "surface.json", folder / "fused.ply"
+    if not path.is_file() or not fused.is_file() or path.stat().st_mtime < fused.stat().st_mtime:
+        return {}
+    found = read_json(path)
+    if value(found, "status") == "empty":
+        return {"Mesh": f"None: {value(found, 'reason')}"}
+    shares = ", ".join(
+        f"{percent(value(found, kind))} {kind}" for kind in ("measured", "unconfirmed", "bridged", "open")
+    )
+    drawings = f", objects/{folder.name}/drawings/drawings.pdf" if (folder / "drawings").is_dir() else ""
+    return {"Mesh": f"{shares}; objects/{folder.name}/surface.glb{drawings}"}
 
 
 def _accuracy(has: dict[str, Any], unit: str) -> dict[str, str]:

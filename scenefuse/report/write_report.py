@@ -11,7 +11,7 @@ import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.version import VERSION
-from scenefuse.report.facts import object_facts, scene_facts
+from scenefuse.report.facts import object_facts, scene_facts, surface_facts
 from scenefuse.report.page import asset, document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
 from scenefuse.report.tables import records
@@ -119,7 +119,8 @@ def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str
     parts = [f'<section class="card" id="{escape(folder.name)}"><h2>{escape(folder.name)}{badge}</h2>']
     is_finished, figures = status not in UNFINISHED, folder / "figures"
     pictures = [_slider(figures)] if status in ADDED and (figures / "before.png").is_file() else []
-    parts.append(f'<div class="pair">{"".join(pictures)}{_facts(object_facts(row))}</div>')
+    facts = object_facts(row) | (surface_facts(folder) if is_finished else {})
+    parts.append(f'<div class="pair">{"".join(pictures)}{_facts(facts)}</div>')
     if view is not None and is_finished:
         parts.append(view_section(f"object-{folder.name}", folder.name, view))
     elif status in texts["no_view"]:

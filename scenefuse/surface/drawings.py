@@ -9,6 +9,7 @@ import numpy as np
 import pyproj
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
@@ -17,9 +18,10 @@ from scipy.spatial import cKDTree
 
 from scenefuse.core.stage import atomic_directory, quantity, read_json, threads, write_json
 from scenefuse.core.transforms import Array
+from scenefuse.fuse.compare import MARGIN
 from scenefuse.fuse.measure import SUPPORT
 from scenefuse.photos.geodesy import length_unit, scene_frame
-from scenefuse.surface.gltf import Painted, metres_per_unit, read_painted
+from scenefuse.surface.gltf import BRIDGED_TINT, Painted, metres_per_unit, read_painted
 from scenefuse.surface.make_surface import read_surface
 from scenefuse.surface.mesh import FaceClass, Surface, cast, caster
 from scenefuse.surface.texture import MAX_SIDE_PX
@@ -102,7 +104,9 @@ def draw(surface: Surface, painted: Painted | None, axes: Array, pixel: float) -
         colors[on, :3] = (surface.vertices.colors[corner] * weights[..., None]).sum(1)
     if painted is not None:
         found = cast(caster(painted.points @ axes.T, painted.faces), origins, down)
-        of = np.flatnonzero(on & np.isfinite(found["t_hit"]))
+        # Where a gap is bridged nothing is painted, and the ray goes on to another part.
+        away = np.abs(found["t_hit"] - np.where(on, hit["t_hit"], -np.inf))
+        of = np.flatnonzero(away <= MARGIN * surface.vertices.diagonal)
         uv = painted.uv[painted.faces[found["primitive_ids"][of].astype(np.int64)]]
         at = (uv * _weights(found["primitive_uvs"][of])[..., None]).sum(1) * painted.picture.shape[1::-1] - 0.5
         for k in range(3):
@@ -131,7 +135,7 @@ def wall_turn(surface: Surface) -> float:
 def draw_surface(*, name: str, surface: Path, glb: Path, georeference_json: Path | None = None, folder: Path) -> None:
     """Draw an object from above and from four sides.
 
-    Of each drawing NAME: NAME.png, a sheet with frame and scale bar, bridged parts hatched; NAME.tif, the picture;
+    Of each drawing NAME: NAME.png, a sheet with frame and scale bar, bridged parts tinted; NAME.tif, the picture;
     NAME_height.tif, NAME_class.tif, NAME_deviation.tif. `above` is a GeoTIFF in the scene's CRS where it has one.
     Elevations are turned to the object's walls. drawings.pdf has all sheets, A3, to the scale that they say.
 
@@ -157,6 +161,9 @@ def draw_surface(*, name: str, surface: Path, glb: Path, georeference_json: Path
             if side != "above":
                 c, s = np.cos(turn), np.sin(turn)
                 axes = axes @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+                if frame is not None:
+                    middle = whole.vertices.points.mean(0, keepdims=True)
+                    shift[1] = (frame.in_crs(middle) - middle)[0, 2]
             elif frame is not None:
                 crs, shift = frame.crs, np.floor(frame.in_crs(np.zeros((1, 3)))[0])
                 vertices = whole.vertices
@@ -169,7 +176,9 @@ def draw_surface(*, name: str, surface: Path, glb: Path, georeference_json: Path
             )
             scale = _scale(drawing, metres)
             title = f"{name} from {'above' if side == 'above' else 'the ' + side}{azimuth}"
-            figure = _sheet(drawing, f"{title}; 1:{scale}" if unit != "scene units" else title, unit, metres / scale)
+            title += f"; 1:{scale}" if unit != "scene units" else ""
+            left = drawing.left + shift[0] if side == "above" else 0.0
+            figure = _sheet(drawing, title, unit, metres / scale, (left, drawing.top + shift[1]))
             figure.savefig(output / f"{side}.png", dpi=200)
             pages.savefig(figure)
             report[f"{side}_pixel"], report[f"{side}_scale"] = quantity(drawing.pixel, unit), quantity(scale, "1")
@@ -226,24 +235,32 @@ def _scale(drawing: Drawing, metres: float) -> int:
     return max(1, round(next(k for k in (1, 2, 5, 10) if k * power >= needed) * power))
 
 
-def _sheet(drawing: Drawing, title: str, unit: str, page_per_unit: float) -> Figure:
-    """A page with a frame, a scale bar and hatched bridges; page_per_unit: metres of the page for a unit."""
+def _sheet(drawing: Drawing, title: str, unit: str, page_per_unit: float, corner: tuple[float, float]) -> Figure:
+    """A page with a frame, a scale bar and tinted bridges.
+
+    Args:
+        drawing: what is on it.
+        title: above the frame.
+        unit: of lengths.
+        page_per_unit: metres of the page for a unit.
+        corner: what the frame says of its upper left.
+    """
     inch = 0.0254
     height, width = (side * drawing.pixel for side in drawing.classes.shape)
     figure = Figure(figsize=(PAGE[0] / inch, PAGE[1] / inch), facecolor="white")
     size = width * page_per_unit / PAGE[0], height * page_per_unit / PAGE[1]
     axes = figure.add_axes(((1 - size[0]) / 2, (1 - size[1]) / 2, *size))
-    extent = (drawing.left, drawing.left + width, drawing.top - height, drawing.top)
-    axes.imshow(drawing.colors, extent=extent, interpolation="antialiased")
-    bridged = (drawing.classes == FaceClass.BRIDGED).astype(float)
-    if bridged.any():
-        axes.contourf(bridged, [0.5, 1.5], extent=extent, origin="upper", hatches=["//////"], colors="none")
-    axes.set(xlim=extent[:2], ylim=extent[2:])
+    picture = drawing.colors.copy()
+    picture[drawing.classes == FaceClass.BRIDGED, :3] = BRIDGED_TINT
+    extent = (corner[0], corner[0] + width, corner[1] - height, corner[1])
+    axes.imshow(picture, extent=extent, interpolation="antialiased")
+    axes.ticklabel_format(useOffset=False, style="plain")
     axes.tick_params(labelsize=7)
-    axes.set_title(title, fontsize=10)
+    axes.set_title(f"{title} ({unit})", fontsize=10)
     bar = 10.0 ** np.floor(np.log10(width / 4))
     bar *= next(k for k in (5, 2, 1) if k * bar <= width / 2)
-    axes.plot([extent[0] + width / 50, extent[0] + width / 50 + bar], [extent[2] + height / 30] * 2, "k-", linewidth=4)
-    axes.text(extent[0] + width / 50, extent[2] + height / 20, f"{bar:g} {unit}", fontsize=8)
-    figure.text(0.5, 0.04, "hatched: interpolated; white: nothing measured", ha="center", fontsize=7)
+    left, low = (1 - size[0]) / 2, (1 - size[1]) / 2 - 0.05
+    figure.add_artist(Line2D([left, left + bar * page_per_unit / PAGE[0]], [low, low], color="black", linewidth=4))
+    figure.text(left, low + 0.01, f"{bar:g} {unit}", fontsize=8)
+    figure.text(left, low - 0.02, "purple: interpolated; white: not measured", fontsize=8)
     return figure

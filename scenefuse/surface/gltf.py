@@ -24,8 +24,8 @@ from scenefuse.surface.mesh import FaceClass, Surface
 
 # (x, y, z) east, north, up to glTF's x east, y up, z south.
 Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-# What nobody measured is drawn in one colour (linear RGBA), which photos of objects hardly hold.
-BRIDGED_TINT = (0.6, 0.1, 0.5, 1.0)
+# What nobody measured is drawn in one colour (sRGB), which photos of objects hardly hold.
+BRIDGED_TINT = (203, 89, 188)
 
 
 class _Code(IntEnum):
@@ -92,7 +92,11 @@ def write_glb(
             primitives.append(_primitive(buffer, surface.part(chosen), kind, metres, corners))
     unlit: dict[str, Any] = {"extensions": {"KHR_materials_unlit": {}}, "doubleSided": True}
     colored: dict[str, Any] = {"name": "photos", "pbrMetallicRoughness": {"metallicFactor": 0.0}, **unlit}
-    tinted = {"name": "bridged", "pbrMetallicRoughness": {"baseColorFactor": BRIDGED_TINT}, **unlit}
+    tinted = {
+        "name": "bridged",
+        "pbrMetallicRoughness": {"baseColorFactor": [*_linear(np.array(BRIDGED_TINT)), 1.0]},
+        **unlit,
+    }
     content: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"scenefuse {VERSION}", "extras": extras},
         "scene": 0,
@@ -185,9 +189,7 @@ def _primitive(buffer: _Buffer, part: Surface, kind: FaceClass, metres: float, u
     if uv is not None:
         attributes["TEXCOORD_0"] = buffer.accessor(places.astype(np.float32), "VEC2", _Code.FLOAT)
     elif vertices.colors is not None and kind != FaceClass.BRIDGED:
-        linear = np.where(
-            vertices.colors <= 10, vertices.colors / 3294.6, ((vertices.colors / 255 + 0.055) / 1.055) ** 2.4
-        )
+        linear = _linear(vertices.colors)
         rgba = np.column_stack([np.rint(65535 * linear), np.full(len(linear), 65535)]).astype(np.uint16)
         attributes["COLOR_0"] = buffer.accessor(rgba, "VEC4", _Code.UNSIGNED_SHORT, normalized=True)
     return {
@@ -199,6 +201,11 @@ def _primitive(buffer: _Buffer, part: Surface, kind: FaceClass, metres: float, u
         },
         "extras": {"class": kind.name.lower()},
     }
+
+
+def _linear(colors: NDArray[Any]) -> Array:
+    """Linear colours, 0..1, of those of sRGB, 0..255."""
+    return np.where(colors <= 10, colors / 3294.6, ((colors / 255 + 0.055) / 1.055) ** 2.4)
 
 
 def metres_per_unit(georeference_json: Path | None) -> float:

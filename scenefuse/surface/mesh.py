@@ -18,6 +18,7 @@ from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import MARGIN, SAME_PLACE_SPACINGS, THROUGH_PHOTOS
 from scenefuse.fuse.measure import MIN_NEIGHBOURS, SUPPORT, Evidence, with_normals
+from scenefuse.geometry.photo_kernel import MIN_COSINE
 from scenefuse.photos.workspace import View
 
 Rows = NDArray[np.int64]
@@ -190,29 +191,38 @@ def _bridges(
 ) -> tuple[Mask, Mask]:
     """(F,) faces that bridge a gap, and those of gaps that stay open.
 
-    A gap is a piece of the candidate without points beside it, all of it in their box or half a gap's width beyond. It
-    is bridged where it is nowhere wider than MAX_GAP, most of its rim is measured, and photos do not see through it.
+    A gap is a piece of the candidate without points beside it, all of it in their box or half a gap's width beyond, and
+    wider than MAX_GAP everywhere or nowhere. In the latter case it is bridged where most of its rim is measured and
+    photos do not see through it.
     """
     far = np.flatnonzero(~near)
     pairs, alone = _neighbours(faces)
     place = np.full(len(faces), -1)
     place[far] = np.arange(len(far))
-    linked = pairs[(place[pairs] >= 0).all(1)]
-    graph = coo_matrix((np.ones(len(linked)), place[linked].T), shape=(len(far), len(far)))
+    # What lies in a ball of that width without points is wide.
+    half, middle = MAX_GAP / 2 * cloud.diagonal, points[faces[far]].mean(1)
+    wide = distance[far] > half
+    if wide.any():
+        wide |= cKDTree(middle[wide]).query(middle, workers=threads())[0] <= half
+    linked = place[pairs[(place[pairs] >= 0).all(1)]]
+    linked = linked[wide[linked[:, 0]] == wide[linked[:, 1]]]
+    graph = coo_matrix((np.ones(len(linked)), linked.T), shape=(len(far), len(far)))
     count, gap = connected_components(graph, directed=False)
-    half_width, at_border = np.zeros(count), np.zeros(count, dtype=bool)
-    np.maximum.at(half_width, gap, distance[far])
+    at_border = np.zeros(count, dtype=bool)
     at_border[gap[~inside[far] | alone[far]]] = True
-    rim = pairs[(place[pairs] >= 0).sum(1) == 1]
-    rim = np.where(place[rim[:, :1]] >= 0, rim, rim[:, ::-1])
-    of, measured = gap[place[rim[:, 0]]], classes[rim[:, 1]] == FaceClass.MEASURED
-    rim_length, confirmed = np.bincount(of, minlength=count), np.bincount(of, measured, count)
-    good = ~at_border & (2 * half_width <= MAX_GAP * cloud.diagonal) & (confirmed >= SUPPORT * rim_length)
+    # Faces of gaps, each beside one that is not of it.
+    rim = np.concatenate([pairs, pairs[:, ::-1]])
+    rim = rim[place[rim[:, 0]] >= 0]
+    of = gap[place[rim[:, 0]]]
+    beside = np.where(near[rim[:, 1]], -1, gap[place[rim[:, 1]]])
+    of, rim = of[of != beside], rim[of != beside]
+    measured = classes[rim[:, 1]] == FaceClass.MEASURED
+    good = ~at_border & (np.bincount(of, measured, count) >= SUPPORT * np.bincount(of, minlength=count))
+    good[gap[wide]] = False
     tried = good[gap]
-    chosen = far[tried]
-    if views and len(chosen):
+    if views and tried.any():
         kept = caster(points, faces[classes == FaceClass.MEASURED])
-        seen = _seen_through(points[faces[chosen]].mean(1), kept, views, MARGIN * cloud.diagonal)
+        seen = _seen_through(points[faces[far[tried]]], kept, views, MARGIN * cloud.diagonal)
         through = np.bincount(gap[tried], seen, count)
         good &= through < SUPPORT * np.bincount(gap, minlength=count)
     bridged, is_open = np.zeros(len(faces), dtype=bool), np.zeros(len(faces), dtype=bool)
@@ -236,15 +246,21 @@ def cast(scene, origins: Array, directions: Array) -> dict[str, NDArray[np.float
     return {name: values.numpy() for name, values in scene.cast_rays(rays, nthreads=threads()).items()}
 
 
-def _seen_through(places: Array, scene, views: list[View], margin: float) -> Mask:  # type: ignore[no-untyped-def]
-    """(N,) places behind which enough photos see the front of a measured face, farther off than a margin."""
-    count = np.zeros(len(places), np.int64)
+def _seen_through(corners: Array, scene, views: list[View], margin: float) -> Mask:  # type: ignore[no-untyped-def]
+    """(N,) faces (N, 3, 3) behind which enough photos see the front of a measured face, farther off than a margin.
+
+    Photos that look along a face are not counted: they may see past it.
+    """
+    places, count = corners.mean(1), np.zeros(len(corners), np.int64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     for view in views:
         rows = view.visible(places)[0]
         rays = places[rows] - view.centre
         hit = cast(scene, view.centre, rays)
         length = np.linalg.norm(rays, axis=1)
         front = (hit["primitive_normals"] * rays).sum(1) < 0
+        front &= np.abs((normals[rows] * rays).sum(1)) >= MIN_COSINE * length
         count[rows] += front & np.isfinite(hit["t_hit"]) & ((hit["t_hit"] - 1) * length > margin)
     return count >= THROUGH_PHOTOS
 

@@ -1,6 +1,8 @@
 """Surfaces of completed clouds: classes of faces, gaps, and the files that hold them."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +12,13 @@ import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from scenefuse import command_line
 from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3, look_at
 from scenefuse.fuse.measure import Evidence
 from scenefuse.photos.workspace import View, read_views, write_model
+from scenefuse.report.facts import surface_facts
 from scenefuse.surface.cameras import export_cameras
 from scenefuse.surface.drawings import NOTHING, SIDES, Tag, draw_surface, wall_turn
 from scenefuse.surface.gltf import write_glb
@@ -93,11 +97,12 @@ def test_shares_of_the_classes_sum_to_the_whole_area(closed):
     )
 
 
-def plate_over_ground() -> Cloud:
-    """A box over the ground with a narrow gap in its top and a wide one below that."""
+def plate_over_ground(wide: float = 0.03, slit: float = 0.03) -> Cloud:
+    """A box over the ground with a square gap and a slit of 0.06 in its top, and a wide gap below."""
     rng = np.arange(-0.6, 0.6, 0.0125)
     x, y = (a.ravel() for a in np.meshgrid(rng, rng))
-    narrow, wide = np.maximum(abs(x), abs(y)) > 0.03, np.maximum(abs(x), abs(y)) > 0.2
+    top_there = (np.maximum(abs(x), abs(y)) > wide) & ((abs(x) > slit) | (abs(y) > 0.03))
+    below_there = np.maximum(abs(x), abs(y)) > 0.2
     up, down = np.tile([0.0, 0, 1], (len(x), 1)), np.tile([0.0, 0, -1], (len(x), 1))
     top, bottom = np.column_stack([x, y, 0 * x + 1]), np.column_stack([x, y, 0 * x + 0.6])
     far = np.arange(-1.5, 1.5, 0.03)
@@ -106,10 +111,10 @@ def plate_over_ground() -> Cloud:
     for turn in range(4):
         side = np.column_stack([0 * x + 0.6, x, 0.8 + y / 3])
         sides.append(side @ Rotation.from_euler("z", 90 * turn, degrees=True).as_matrix().T)
-    points = np.concatenate([top[narrow], bottom[wide], ground, *sides])
+    points = np.concatenate([top[top_there], bottom[below_there], ground, *sides])
     outwards = [s * [1, 1, 0] / np.abs(s[:, :2]).max(1, keepdims=True) for s in sides]
     outwards = [np.where(abs(abs(o) - 1) < 1e-6, np.sign(o), 0) * [1, 1, 0] for o in outwards]
-    normals = np.concatenate([up[narrow], down[wide], np.tile([0.0, 0, 1], (len(ground), 1)), *outwards])
+    normals = np.concatenate([up[top_there], down[below_there], np.tile([0.0, 0, 1], (len(ground), 1)), *outwards])
     return with_evidence(points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9))
 
 
@@ -132,6 +137,15 @@ def test_a_gap_that_photos_see_through_stays_open():
         middle = surface.vertices.points[surface.faces[surface.classes == FaceClass.BRIDGED]].mean(1)
         bridges.append(int(((np.abs(middle[:, :2]).max(1) < 0.03) & (np.abs(middle[:, 2] - 1) < 0.03)).sum()))
     assert bridges[0] > 5 and bridges[1] == 0
+
+
+def test_a_slit_is_bridged_up_to_where_it_widens():
+    surface = make_mesh(plate_over_ground(0.15, 0.45), [])
+    middle = np.abs(surface.vertices.points[surface.faces].mean(1) - [0, 0, 1])
+    top = (middle[:, 1] < 0.008) & (middle[:, 2] < 0.03)
+    slit = top & (middle[:, 0] > 0.3) & (middle[:, 0] < 0.4)
+    assert slit.sum() > 5 and (surface.classes[slit] == FaceClass.BRIDGED).all()
+    assert not (top & (middle[:, 0] < 0.1)).any()
 
 
 def test_points_in_a_line_have_no_surface_and_the_stage_says_so(tmp_path: Path):
@@ -266,3 +280,33 @@ def test_cameras_of_both_sides_are_exported_in_the_frame_of_the_scene(tmp_path: 
     assert np.allclose(matrix[:3, 3], pose.apply(centre))
     # OpenGL's cameras look along -z: down, here.
     assert matrix[2, 2] > 0.99
+
+
+def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "export"])
+    with pytest.raises(SystemExit, match="no object has a results/objects/NAME/fused.ply here; run the workflow first"):
+        command_line.main()
+    for name in ("objects/shed/fused.ply", "objects/barn/fused.ply", "scenes/yard/dense.ply", "summary/report.html"):
+        (tmp_path / "results" / name).parent.mkdir(parents=True)
+        (tmp_path / "results" / name).touch()
+    runs = []
+    monkeypatch.setattr(
+        subprocess, "run", lambda words, **_: runs.append(words) or subprocess.CompletedProcess(words, 0)
+    )
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "export", "--object", "shed", "--cores", "2"])
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    # No side has photos, so there are no cameras.
+    assert ended.value.code == 0 and not any("cameras" in word for word in runs[0][:6])
+    assert {"results/objects/shed/surface.glb", "results/objects/shed/drawings", "2"} <= set(runs[0])
+    assert "results/summary/report.html" in runs[1]
+    assert capsys.readouterr().out == "Export: results/objects/shed/surface.glb, results/objects/shed/drawings\n"
+
+
+def test_the_report_says_of_a_surface_how_much_is_measured(closed, tmp_path: Path):
+    assert surface_facts(tmp_path) == {}
+    (tmp_path / "fused.ply").touch()
+    write_json(tmp_path / "surface.json", surface_report(closed, "m") | {"reason": quantity("", "")})
+    found = surface_facts(tmp_path)["Mesh"]
+    assert "% measured" in found and "% open" in found and found.endswith(f"objects/{tmp_path.name}/surface.glb")

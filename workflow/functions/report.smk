@@ -44,6 +44,12 @@ def results_of(wildcards):
     ]
 
 
+def exported_surfaces():
+    """The reports of the surfaces that `scenefuse export` has made."""
+    files = [Path(f"results/objects/{name}/surface.json") for name in OBJECTS]
+    return [str(path) for path in files if path.is_file()]
+
+
 def what_is_given(row):
     """What of a scene or an object its row gives: photos, cloud, or both."""
     if not row.get("cloud"):

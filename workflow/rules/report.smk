@@ -214,6 +214,7 @@ rule write_report:
         views=expand("results/scenes/{scene}/view.json", scene=SCENES),
         figures=expand("results/objects/{object}/figures", object=OBJECTS),
         paper=PAPER,
+        surfaces=lambda wildcards: exported_surfaces(),
     output:
         "results/summary/report.html",
     log:
