@@ -256,7 +256,7 @@ def cloud_of(columns: Columns, white: float | None = None) -> Cloud:
 def write_cloud(path: Path, cloud: Cloud) -> None:
     """Write a binary PLY atomically: positions as float64, normals float32, colours uint8, fields as they are.
 
-    PLY allows no spaces in a field's name: they become underscores.
+    Fields are `scalar_NAME` in it. PLY allows no spaces in a name: they become underscores.
     """
     vertex = records_of(cloud, path)
     with atomic_file(path) as temporary, open(temporary, "wb") as file:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from scenefuse.cloud.clouds import Cloud, cloud_of, read_cloud, records_of
+from scenefuse.cloud.readers.ply import FIELD, in_file
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Sim3
@@ -142,11 +143,14 @@ def surface_report(surface: Surface, unit: str) -> dict[str, Any]:
 
 def write_surface(path: Path, surface: Surface) -> None:
     """Write a binary PLY mesh."""
-    vertices = PlyElement.describe(records_of(surface.vertices, path), "vertex")
+    records = records_of(surface.vertices, path)
+    records.dtype.names = tuple(map(in_file, records.dtype.names or ()))
     faces = np.empty(len(surface.faces), [("vertex_indices", "i4", (3,)), ("class", "u1")])
     faces["vertex_indices"], faces["class"] = surface.faces, surface.classes
     with atomic_file(path) as temporary:
-        PlyData([vertices, PlyElement.describe(faces, "face")], byte_order="<").write(str(temporary))
+        PlyData([PlyElement.describe(records, "vertex"), PlyElement.describe(faces, "face")], byte_order="<").write(
+            str(temporary)
+        )
 
 
 def read_surface(path: Path) -> Surface:
@@ -158,7 +162,7 @@ def read_surface(path: Path) -> Surface:
     try:
         content = PlyData.read(str(path))
         table, faces = content["vertex"].data, content["face"].data
-        columns = {name: np.asarray(table[name]) for name in table.dtype.names}
+        columns = {name.removeprefix(FIELD): np.asarray(table[name]) for name in table.dtype.names}
         indices = np.asarray(faces["vertex_indices"].tolist(), np.int64).reshape(-1, 3)
     except Exception as error:
         raise StageError(f"{path} is no surface ({error}); make it again with scenefuse export") from None

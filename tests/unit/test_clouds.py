@@ -32,6 +32,14 @@ def test_ply_keeps_every_bit(tmp_path):
     assert after.fields["source"].dtype == np.uint8
 
 
+def test_fields_have_names_that_cloudcompare_loads_and_older_names_are_read(tmp_path):
+    write_cloud(tmp_path / "a.ply", cloud())
+    content = (tmp_path / "a.ply").read_bytes()
+    assert b"property uchar scalar_source\n" in content and b"property double x\n" in content
+    (tmp_path / "a.ply").write_bytes(content.replace(b"scalar_source", b"source"))
+    assert set(read_cloud(tmp_path / "a.ply").fields) == {"source", "confidence"}
+
+
 def test_laz_round_trip_at_utm_coordinates_is_a_millimetre(tmp_path):
     import laspy
 

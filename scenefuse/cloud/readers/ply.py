@@ -9,6 +9,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from scenefuse.cloud.readers.columns import (
+    COLOR,
+    NORMAL,
     POSITION,
     Columns,
     bytes_of,
@@ -28,7 +30,8 @@ TYPES = {name: kind for kind, name in NAMES.items()} | dict(
     zip(("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"), KINDS)
 )
 
-
+# What fields are called by in a file: CloudCompare reads these without being told to.
+FIELD = "scalar_"
 # What the list of a face's corners is called.
 CORNERS = ("vertex_indices", "vertex_index")
 
@@ -126,7 +129,8 @@ def _mesh_of_bytes(path: Path) -> tuple[Columns, list[Any]]:
 
     content = PlyData.read(path)
     vertex = content["vertex"].data
-    columns = {name: np.array(vertex[name]) for name in vertex.dtype.names if vertex.dtype[name].kind in "iuf"}
+    names = [name for name in vertex.dtype.names if vertex.dtype[name].kind in "iuf"]
+    columns = {name.removeprefix(FIELD): np.array(vertex[name]) for name in names}
     face = content["face"].data if "face" in content else np.empty(0, [("", "u1")])
     name = next((name for name in CORNERS if name in (face.dtype.names or ())), None)
     return columns, [] if name is None else list(face[name])
@@ -201,8 +205,14 @@ def header_of(elements: list[Element]) -> bytes:
     for element in elements:
         lines.append(f"element {element.name} {element.count}")
         assert element.row is not None and element.row.names is not None
-        lines += [f"property {NAMES[element.row[name].str[1:]]} {name}" for name in element.row.names]
+        names = map(in_file, element.row.names) if element.name == "vertex" else element.row.names
+        lines += [f"property {NAMES[element.row[k].str[1:]]} {name}" for k, name in enumerate(names)]
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
+def in_file(name: str) -> str:
+    """What a column of points is called in a PLY."""
+    return name if name in {*POSITION, *NORMAL, *COLOR} else FIELD + name
 
 
 def _lines(file: BinaryIO) -> list[str]:
@@ -222,7 +232,7 @@ def _elements(lines: list[str], order: str) -> list[Element]:
         if words[:1] == ["element"]:
             found.append((words[1], int(words[2]), {}))
         elif words[:1] == ["property"]:
-            name, columns = words[-1], found[-1][2]
+            name, columns = words[-1].removeprefix(FIELD), found[-1][2]
             while name in columns:
                 name += "_"
             columns[name] = words[1]
