@@ -20,8 +20,8 @@ from scenefuse.fuse.measure import Evidence
 from scenefuse.photos.workspace import View, read_views, write_model
 from scenefuse.report.facts import surface_facts
 from scenefuse.surface.cameras import export_cameras
-from scenefuse.surface.drawings import NOTHING, SIDES, Tag, draw_surface, wall_turn
-from scenefuse.surface.gltf import write_glb
+from scenefuse.surface.drawings import NOTHING, SIDES, Tag, draw, draw_surface, wall_turn
+from scenefuse.surface.gltf import Painted, write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
 from scenefuse.surface.mesh import FaceClass, make_mesh
 from scenefuse.surface.texture import textured
@@ -230,6 +230,17 @@ def test_an_elevation_has_the_scale_that_it_says(closed, tmp_path: Path):
     # What photos do not confirm is below.
     assert (np.asarray(Image.open(tmp_path / "d/above_class.tif")) != FaceClass.UNCONFIRMED).mean() > 0.97
     assert (tmp_path / "d/drawings.pdf").read_bytes()[:4] == b"%PDF"
+
+
+def test_a_bridge_is_not_drawn_in_the_colours_of_what_lies_behind_it(closed):
+    below = closed.part(closed.vertices.points[closed.faces][..., 2].max(1) < 0)
+    red = np.full((8, 8, 3), (255, 0, 0), np.uint8)
+    painted = Painted(below.vertices.points, below.faces, np.full((len(below.vertices), 2), 0.5), red)
+    from_above = draw(closed, painted, np.eye(3), 0.02).colors
+    from_below = draw(closed, painted, np.diag([1.0, -1, -1]), 0.02).colors
+    shown = from_above[..., 3] > 0
+    assert shown.any() and not (from_above[shown, :3] == [255, 0, 0]).all(1).any()
+    assert (from_below[from_below[..., 3] > 0][:, :3] == [255, 0, 0]).all(1).mean() > 0.9
 
 
 def test_a_drawing_from_above_lies_in_the_crs_of_its_scene(closed, tmp_path: Path):
