@@ -1,6 +1,6 @@
 """Registration in landscapes up to thirty times as wide as the object, by shape and colours alone.
 
-PYTHONPATH=tests python tests/benchmarks/registration_wide.py --table docs/results/planted_wide.tsv
+PYTHONPATH=.:tests python tests/benchmarks/registration_wide.py --table docs/results/planted_wide.tsv
 
 Every fifth trial has another object where this one would stand; every pose is wrong there.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pandas as pd
-from registration import FIRST_REPEAT, METHODS, ROTATION_DEG, SCALE_PCT, SHIFT, Found
+from benchmarks.registration import FIRST_REPEAT, METHODS, ROTATION_DEG, SCALE_PCT, SHIFT, Found
 from support.planted import SHAPES, Trial, errors, plant_wide
 
 from scenefuse.core.stage import run

@@ -4,7 +4,6 @@ For each object: F-scores of the completed cloud and of its surface, the error o
 PSNR of held-out photos' right halves inside the mask (gain fitted on the left; holes count), and processor time.
 """
 
-import argparse
 import csv
 import resource
 from pathlib import Path
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from scenefuse.cloud.clouds import read_cloud
-from scenefuse.core.stage import read_json, value
+from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.metrics.evaluate_object import read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.true_cameras import read_cameras
@@ -114,18 +113,25 @@ def row(results: Path, name: str) -> dict[str, str]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--results", type=Path, default=Path("results"))
-    parser.add_argument("--table", type=Path, default=Path("docs/results/surface.tsv"))
-    parser.add_argument("--objects", nargs="+", default=["house", "balloon", "sculpture"])
-    given = parser.parse_args()
-    rows = [row(given.results, name) for name in given.objects]
-    with open(given.table, "w", newline="") as file:
+def surface(
+    *,
+    results: Path = Path("results"),
+    table: Path = Path("docs/results/surface.tsv"),
+    objects: tuple[str, ...] = ("house", "balloon", "sculpture"),
+) -> None:
+    """Write the table.
+
+    Args:
+        results: of a finished demo.
+        table: output, TSV with a column for each object.
+        objects: their names.
+    """
+    rows = [row(results, name) for name in objects]
+    with open(table, "w", newline="") as file:
         writer = csv.writer(file, delimiter="\t", lineterminator="\n")
         for measure in rows[0]:
             writer.writerow([measure, *(one[measure] for one in rows)])
 
 
 if __name__ == "__main__":
-    main()
+    run(surface)
