@@ -56,7 +56,7 @@ def pick(
     """
     session = Session(object, configfile)
     port, shows = _free_port(port), has_screen() and not no_browser
-    entrance = Entrance(port, Path("results/pick/open.html"), print if not shows else lambda _: None)
+    entrance = Entrance(port, Path(f"results/pick/open-{port}.html"), print if not shows else lambda _: None)
     app.add_middleware(Guard, entrance=entrance, key=session.key, port=port)
     app.config.socket_io_js_query_params["key"] = session.key
     add_pictures(app, session)
@@ -140,9 +140,11 @@ class Entrance:
         self._token = secrets.token_urlsafe()
         self.address = f"http://{HOST}:{self._port}/#{self._token}"
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        self.file.unlink(missing_ok=True)
-        with open(os.open(self.file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+        written = self.file.with_suffix(".tmp")
+        written.unlink(missing_ok=True)
+        with open(os.open(written, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
             file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={self.address}">')
+        written.replace(self.file)
 
 
 class Guard:

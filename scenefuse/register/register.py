@@ -147,10 +147,10 @@ def register_clouds(
     Raises:
         StageError: too few different points, or all in one place or along one line, on either side.
     """
-    return _compared(_registered(obj, scene, settings, seed, ups, scales, unit), obj, scene, settings, seed)
+    return with_agreement(register_once(obj, scene, settings, seed, ups, scales, unit), obj, scene, settings, seed)
 
 
-def _registered(
+def register_once(
     obj: Cloud,
     scene: Cloud,
     settings: RegistrationSettings,
@@ -175,7 +175,9 @@ def _registered(
     return Registration(outcome.decision.registered, outcome.decision.reason, whole, outcome, origins, scales, {}, unit)
 
 
-def _compared(found: Registration, obj: Cloud, scene: Cloud, settings: RegistrationSettings, seed: int) -> Registration:
+def with_agreement(
+    found: Registration, obj: Cloud, scene: Cloud, settings: RegistrationSettings, seed: int
+) -> Registration:
     """A registration with how well both clouds agree at its pose."""
     if found.outcome is None:
         return found
@@ -211,14 +213,14 @@ def find_in_scene(
     Raises:
         StageError: as of `register_clouds`.
     """
-    tried = [(_registered(obj, scene, settings, seed, ups, scales, unit), scene)]
+    tried = [(register_once(obj, scene, settings, seed, ups, scales, unit), scene)]
     for rows in likely_places(obj, scene, up_in_scene, settings.crop, seed, settings.coarse.keep):
         with contextlib.suppress(StageError):  # too few different points there
-            tried.append((_registered(obj, scene[rows], settings, seed, ups, scales, unit), scene[rows]))
+            tried.append((register_once(obj, scene[rows], settings, seed, ups, scales, unit), scene[rows]))
     found, part = max(tried, key=lambda one: (one[0].registered, one[0].total))
     if len(tried) > 1:
         found = _unless_elsewhere(found, [other for other, _ in tried], obj, settings.fine)
-    return _compared(found, obj, part, settings, seed), part, len(tried) - 1
+    return with_agreement(found, obj, part, settings, seed), part, len(tried) - 1
 
 
 def _unless_elsewhere(

@@ -15,5 +15,5 @@ def registered_at_once(monkeypatch, pose: Sim3, registered: bool = True) -> None
         origins, unit = (np.zeros(3), np.zeros(3)), str(known[-1])
         return Registration(registered, "planted", pose, None, origins, ScaleRange(pose.scale, 0.0), {}, unit)
 
-    monkeypatch.setattr(register, "_registered", found)
+    monkeypatch.setattr(register, "register_once", found)
     monkeypatch.setattr(register, "likely_places", lambda *known: [])

@@ -66,8 +66,8 @@ def tried(total, at, registered=True, precision=0.7):
 def chosen(monkeypatch, yard, *there):
     """What is chosen of registrations in the whole scene and at places."""
     there = iter(there)
-    monkeypatch.setattr(register, "_registered", lambda *known: next(there))
-    monkeypatch.setattr(register, "_compared", lambda found, *known: found)
+    monkeypatch.setattr(register, "register_once", lambda *known: next(there))
+    monkeypatch.setattr(register, "with_agreement", lambda found, *known: found)
     monkeypatch.setattr(register, "likely_places", lambda *known: [np.arange(300), np.arange(300, 600)])
     return find_in_scene(yard.object, yard.scene, LITTLE, 0)[0]
 
