@@ -178,6 +178,9 @@ def forecast_lines(
         f" demo's; most of it for {', '.join(largest)}",
         f"memory: up to {size_text(1e6 * memory_mb[most])} in one job ({most})",
     ]
+    unknown = [folder.name for folder, size in needed.items() if size is None]
+    if unknown:
+        lines[0] += f"; not counted, for no photos are there: {', '.join(unknown)}"
     if memory_mb[most] > available_mb:
         lines[1] += f", and this machine has {size_text(1e6 * available_mb)}: set fewer pixels or features for it"
     return lines + _disk(needed, keep_maps)
