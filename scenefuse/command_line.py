@@ -12,11 +12,8 @@ from pathlib import Path
 from scenefuse.core.version import VERSION
 
 ALL = "pip install 'scenefuse[all]'"
-OWN_SETTINGS, SCENES, REPORT = (
-    Path("config/config.yaml"),
-    Path("config/scenes.tsv"),
-    Path("results/summary/report.html"),
-)
+OWN_SETTINGS, SCENES = Path("config/config.yaml"), Path("config/scenes.tsv")
+REPORT = Path("results/summary/report.html")
 # Snakemake's options that say how much runs at a time, or that another machine decides it.
 PARALLEL = ("--cores", "-c", "--jobs", "-j", "--profile", "--workflow-profile", "--executor", "-e")
 

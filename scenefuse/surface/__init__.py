@@ -1,1 +1,1 @@
-"""What is handed over: a surface of each completed object, its drawings, tiles and cameras."""
+"""What is handed over: a surface of each completed object, its drawings, and the cameras of both sides."""

@@ -116,8 +116,9 @@ def _said(output: str) -> str:
 
 
 def _short(sentence: str) -> str:
-    """A sentence without the folder of the run, and not too long for a table."""
-    return re.sub(r"/\S*/runs?/|results/(objects|scenes|logs)/", "", sentence).strip()[:200]
+    """A sentence without folders of the run and of this machine, and not too long for a table."""
+    sentence = re.sub(r"/\S*/runs?/|results/(objects|scenes|logs)/", "", sentence)
+    return re.sub(r"(?<![\w.-])/\S*/", "", sentence).strip()[:200]
 
 
 def _killed(run: StubRun, job: str) -> str:
