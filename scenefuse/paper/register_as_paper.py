@@ -48,6 +48,8 @@ EDGE_LENGTH, RANSAC_DISTANCE = 0.9, 1.5
 RANSAC_SAMPLES, CONFIDENCE = 4_000_000, 0.999
 # ICP: the paper's pairing distance in voxels; the spacing in voxels; the paper's iterations.
 ICP_DISTANCE, ICP_SPACING, ICP_ITERATIONS = 0.4, 0.5, 35
+# Open3D leaves mutual filtering out when fewer than this share of the points have a mutual match.
+MIN_MUTUAL_SHARE = 0.1
 # How much the sizes of object and crop, which is cut to it, may differ.
 MAX_SCALE_FACTOR = 2.0
 
@@ -90,7 +92,7 @@ def register_as_paper(
             ledger = [Estimate(scale, matched, True), *ledger]
     held = 1.0 if scale == "none" else ledger[0].scale
     problem = Problem(obj, scene, ScaleRange(held, 0.0), Constraints(ups), seed)
-    pose = paper_coarse(problem)
+    pose, notes = paper_coarse(problem)
     coarse = _rated(problem, pose, SCORE_FRACTION / 2, COARSE_POINTS)
     between = time.perf_counter()
     fine = _rated(problem, paper_fine(obj, scene, pose), FineSettings().voxel_fraction, FINE_POINTS)
@@ -98,7 +100,7 @@ def register_as_paper(
     if picture is not None:
         draw_alignment(picture, obj, scene, fine.pose, seed)
     write_json(scale_report, scale_quantities(ledger, problem.scales, scale))
-    write_json(coarse_report, coarse_quantities([coarse], False, said, between - start))
+    write_json(coarse_report, coarse_quantities([coarse], False, [*said, *notes], between - start))
     write_json(report, _report(fine, problem, inputs.length_unit(), scale, end - between))
 
 
@@ -177,20 +179,30 @@ def agreeing(source: Array, target: Array, distance: float, seed: int) -> NDArra
     return best
 
 
-def paper_coarse(problem: Problem) -> Sim3:
-    """Rigid RANSAC on FPFH matches of the object at its rectified scale.
+def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:
+    """Rigid RANSAC on FPFH matches of the object at its rectified scale, and notes on what Open3D said.
 
     Args:
         problem: the clouds, and the scale at which the object is taken: the centre of the range.
     """
+    import open3d as o3d
 
     voxel = VOXEL_FRACTION * problem.scene.diagonal
     scaled = Sim3(problem.scales.centre, np.eye(3), np.zeros(3))
     source, source_features = _features(scaled.apply(problem.object.points), voxel)
     target, target_features = _features(problem.scene.points, voxel)
+    # A ratio of 0: this call counts the mutual matches and takes no others in their place, as RANSAC does below.
+    matches = o3d.pipelines.registration.correspondences_from_features(source_features, target_features, True, 0.0)
+    notes = []
+    if len(matches) < MIN_MUTUAL_SHARE * len(source.points):
+        notes.append(
+            f"{len(matches)} mutual matches are too few for {len(source.points)} points:"
+            " Open3D falls back to one-way matches"
+        )
+        print(notes[-1], flush=True)
     features = source_features, target_features
     result = _ransac((source, target), features, RANSAC_DISTANCE * voxel, problem.seed)
-    return Sim3.from_matrix(np.asarray(result.transformation)) @ scaled
+    return Sim3.from_matrix(np.asarray(result.transformation)) @ scaled, notes
 
 
 def _ransac(clouds: tuple[Any, Any], features: tuple[Any, Any], distance: float, seed: int) -> Any:

@@ -60,7 +60,7 @@ def draw_scene(
     boxes = {name: box_corners(crop.min(0), crop.max(0)) for name, crop in crops.items()}
     drawn = "" if every == 1 else f" (one in {every} is drawn)"
     note = f"{len(scene):,} points{drawn}, objects (boxes): {len(boxes)}, "
-    note += f"cameras (red): {len(views)}. {_calibration(georeferenced)}" if georeferenced else "given as a cloud"
+    note += f"cameras (red): {len(views)}\n{_calibration(georeferenced)}" if georeferenced else "given as a cloud"
     errors = pd.DataFrame() if residuals is None else read_table(residuals)
     save_png(figure, _scene_sheet(name, note, cloud, views, boxes, errors))
 
@@ -85,7 +85,7 @@ def _scene_sheet(
         "from above": orbit_camera(ground, -90.0, 90.0, PANEL_PX, orthographic=True),
         "oblique": orbit_camera(np.concatenate([ground, centres]), -60.0, 30.0, PANEL_PX),
     }
-    (width, height), gap, top = PANEL_PX, 8, 60
+    (width, height), gap, top = PANEL_PX, 8, 72
     size = (2 * (width + gap) + gap, top + (height + gap) * (2 if views else 1))
     sheet = new_figure(size)
     sheet.text(gap / size[0], 1 - 10 / size[1], f"Scene {name}", fontsize=14, fontweight="bold", va="top")

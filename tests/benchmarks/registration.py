@@ -63,7 +63,7 @@ def scenefuse(trial: Trial, scene: Cloud, *, blind: bool = False) -> Found:
 def paper(trial: Trial, scene: Cloud) -> Found:
     """The paper's recipe: RMS scale, FPFH RANSAC at 4 %, point-to-point ICP."""
     scales = ScaleRange(estimates(trial.object, scene, None)[0].scale, 0.0)
-    start = paper_coarse(Problem(trial.object, scene, scales))
+    start, _ = paper_coarse(Problem(trial.object, scene, scales))
     return Found(paper_fine(trial.object, scene, start), True)
 
 

@@ -53,7 +53,7 @@ def thinned(points, voxel):
 def test_ransac_runs_on_voxels_of_4_percent_with_the_papers_distance_samples_and_confidence(clouds, calls):
     obj, scene = clouds
     voxel = 0.04 * diagonal(scene.points)
-    pose = paper_coarse(Problem(obj, scene, ScaleRange(SCALE, 0.0), Constraints(), seed=0))
+    pose, _ = paper_coarse(Problem(obj, scene, ScaleRange(SCALE, 0.0), Constraints(), seed=0))
     args, registration = calls.pop("registration_ransac_based_on_feature_matching"), o3d.pipelines.registration
     assert not calls and pose.scale == SCALE
     source, target, _, _, mutual, distance, estimation, points, checkers, criteria = args
@@ -150,7 +150,7 @@ def test_too_few_matches_give_no_scale_and_say_so(copied, capsys, monkeypatch):
 
 def test_the_papers_recipe_finds_the_pose_of_a_copy(copied):
     obj, scene, pose = copied
-    found = paper_coarse(Problem(obj, scene, ScaleRange(pose.scale, 0.0), Constraints(), seed=0))
+    found, _ = paper_coarse(Problem(obj, scene, ScaleRange(pose.scale, 0.0), Constraints(), seed=0))
     found = paper_fine(obj, scene, found)
     assert rotation_angle_deg(found.rotation @ pose.rotation.T) < 3
     off = np.linalg.norm(found.apply(obj.points) - pose.apply(obj.points), axis=1)
@@ -170,3 +170,12 @@ def test_scale_by_matches_is_held_and_the_ratio_of_whole_clouds_stands_beside_it
     assert value(said, "method") == "ransac_svd" and ledger["ransac_svd"]["used"] and not ledger["rms"]["used"]
     assert value(said, "scale") == ledger["ransac_svd"]["scale"] == pytest.approx(value(fine, "scale"))
     assert ledger["rms"]["scale"] == pytest.approx(pose.scale, rel=0.02)
+
+
+@pytest.mark.parametrize(("shapes", "notes"), [("alike", 0), ("unlike", 1)])
+def test_the_note_says_when_open3d_has_too_few_mutual_matches(clouds, calls, shapes, notes):
+    obj, scene = clouds
+    if shapes == "unlike":
+        x, y = np.meshgrid(np.linspace(0, 9, 60), np.linspace(0, 9, 60))
+        obj = Cloud(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
+    assert len(paper_coarse(Problem(obj, scene, ScaleRange(SCALE, 0.0), Constraints(), seed=0))[1]) == notes
