@@ -1,4 +1,5 @@
 # What the summary reads, the command that writes it, and what is still to be done when a job has failed.
+import platform
 import subprocess
 
 from scenefuse.core.job_records import why_ended
@@ -247,6 +248,7 @@ def hold_run_lock():
     global run_lock
     RUN_LOCK.parent.mkdir(parents=True, exist_ok=True)
     run_lock = RUN_LOCK.open("w")
+    print(platform.node(), file=run_lock, flush=True)
     try:
         fcntl.flock(run_lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:

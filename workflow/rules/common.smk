@@ -2,6 +2,7 @@
 import fcntl
 import glob
 import os
+import platform
 import re
 import shlex
 import shutil
@@ -100,7 +101,8 @@ else:
 
 def remove_dead_lock():
     """Remove the locks of a run on this machine that was killed: no process holds its file any more."""
-    if RUN_LOCK.exists():
+    # Some file systems do not tell machines of each other's locks.
+    if RUN_LOCK.exists() and RUN_LOCK.read_text().strip() == platform.node():
         with RUN_LOCK.open() as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
