@@ -9,6 +9,7 @@ import sys
 import time
 import webbrowser
 from collections.abc import Iterable, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -212,5 +213,9 @@ def _why(lines: Sequence[str]) -> str:
         said = [line.removeprefix(start) for line in lines if line.startswith(start)]
         if said:
             return "; ".join(said)
-    after = (text for line, text in zip(lines, lines[1:]) if ERROR.fullmatch(line))
-    return next(after, "Snakemake ended early")
+    found = next((at + 1 for at, line in enumerate(lines[:-1]) if ERROR.fullmatch(line)), None)
+    if found is None:
+        return "Snakemake ended early"
+    # Indented lines say which files are meant.
+    below = takewhile(lambda line: line.startswith(" "), lines[found + 1 :])
+    return " ".join([lines[found], *map(str.strip, below)])

@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from scenefuse.core.stage import LACK_OF_MEMORY, OUT_OF_MEMORY
+from scenefuse.core.stage import lack_in
 
 ERROR = re.compile(r"\s*(error:|[\w.]*(Error|Exception)\b)")
 KILLED = (
@@ -67,14 +67,14 @@ def why_ended(log: Path, benchmark: Path, started: float) -> str:
 def last_error(log: Path) -> str:
     """The last error line of a log; "" without one."""
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
-    # A library that cannot have memory may end the process.
-    errors = [line for line in lines if ERROR.match(line)] or [line for line in lines if LACK_OF_MEMORY.search(line)]
+    # A library that lacks memory or room may end the process.
+    errors = [line for line in lines if ERROR.match(line)] or [line for line in lines if lack_in(line)]
     if not errors:
         return ""
     last = errors[-1]
     if last.startswith("error: "):
         return last.removeprefix("error: ")
-    return f"{OUT_OF_MEMORY} ({last})" if LACK_OF_MEMORY.search(last) else last
+    return lack_in(last) or last
 
 
 def _finished(log: Path, jobs: JobRecords) -> bool:

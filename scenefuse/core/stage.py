@@ -24,11 +24,17 @@ OUT_OF_MEMORY = (
     "the memory, or a limit on it (ulimit -v, a container's), is too small; raise the limit, end other programs, or use"
     " fewer pixels (config/presets/draft.yaml)"
 )
-# What Python and the libraries say when memory or a thread cannot be had, also while they are loaded.
-LACK_OF_MEMORY = re.compile(
-    "^MemoryError|bad_alloc|[Cc]annot allocate memory|can't allocate memory|failed to map segment|ould not load.*llvm"
-    r"|Unable to allocate|can't start new thread|what\(\): +Resource temporarily unavailable"
-)
+DISK_FULL = "the disk is full{}; free some space and run this again"
+# What Python and the libraries say when memory or a thread cannot be had, also while they are loaded, or disk space.
+LACKS = {
+    OUT_OF_MEMORY: re.compile(
+        "^MemoryError|bad_alloc|[Cc]annot allocate memory|can't allocate memory|failed to map segment"
+        r"|ould not load.*llvm|Unable to allocate|can't start new thread|what\(\): +Resource temporarily unavailable"
+    ),
+    DISK_FULL.format(""): re.compile("out of disk space|No space left on device"),
+}
+# With less room a library may say that something else is wrong; records of jobs and logs take so much at least.
+MIN_FREE_BYTES = 2**20
 STOPPED = "from outside, as Ctrl-C or a time limit does; run again to go on"
 
 
@@ -80,17 +86,11 @@ def run(function: Callable[..., Any]) -> None:
     except StageError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
-    except (PermissionError, NotADirectoryError) as error:
-        if error.filename is None:
-            raise
-        why = (error.strerror or "not allowed").lower()
-        print(f"error: {error.filename}: {why}; check the folder and who may write there", file=sys.stderr)
-        sys.exit(1)
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        said = _of_files(error)
+        if not said:
             raise
-        where = f" ({error.filename})" if error.filename else ""
-        print(f"error: the disk is full{where}; free some space and run this again", file=sys.stderr)
+        print(f"error: {said}", file=sys.stderr)
         sys.exit(1)
     except SystemExit as stop:
         # tyro's, of words that it does not know.
@@ -99,23 +99,46 @@ def run(function: Callable[..., Any]) -> None:
             print(f"error: the stage does not know its command's options (above): {mixed}", file=sys.stderr)
         raise
     except Exception as error:
-        why = _lack_of_memory(error)
+        why = lack_in(error)
         if not why:
             raise
-        print(f"error: {OUT_OF_MEMORY} ({why})", file=sys.stderr)
+        print(f"error: {why}", file=sys.stderr)
         sys.exit(1)
     if isinstance(status, int):
         sys.exit(status)
 
 
-def _lack_of_memory(error: BaseException | None) -> str:
-    """What an error, or one that it was raised from, says of memory; "" for other errors."""
-    while error is not None:
-        said = f"{type(error).__name__}: {error}".removesuffix(": ")
-        if LACK_OF_MEMORY.search(said):
-            return said
-        error = error.__cause__ or error.__context__
+def _of_files(error: OSError) -> str:
+    """What an error of the file system means to a person, in a sentence; "" for other errors."""
+    # Not the temporary name.
+    path = re.sub(r"/?\.[^/]*\.tmp-\d.*", "", str(error.filename or ""))
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return DISK_FULL.format(f" ({path})" if path else "")
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR) and error.filename is not None:
+        why = (error.strerror or "not allowed").lower()
+        return f"{path}: {why}; check the folder and who may write there"
     return ""
+
+
+def lack_in(said: BaseException | str | None) -> str:
+    """What a library says to be lacking, by an error or one that it was raised from, or by a line; "" for nothing."""
+    if isinstance(said, BaseException):
+        line = f"{type(said).__name__}: {said}".removesuffix(": ")
+        return lack_in(line) or lack_in(said.__cause__ or said.__context__)
+    return next((f"{sentence} ({said})" for sentence, pattern in LACKS.items() if said and pattern.search(said)), "")
+
+
+def _find_cause(error: Exception, folder: Path) -> None:
+    """Raise what a library's error does not say: the folder cannot be written to, or its disk is full."""
+    if isinstance(error, OSError):
+        return
+    number = 0
+    if not os.access(folder, os.W_OK):
+        number = errno.EROFS
+    elif shutil.disk_usage(folder).free < MIN_FREE_BYTES:
+        number = errno.ENOSPC
+    if number:
+        raise OSError(number, os.strerror(number), str(folder)) from error
 
 
 def threads() -> int:
@@ -139,6 +162,9 @@ def atomic_file(path: Path) -> Iterator[Path]:
         _sync(temporary)
         os.replace(temporary, path)
         _sync(path.parent)
+    except Exception as error:
+        _find_cause(error, path.parent)
+        raise
     finally:
         _remove_leftovers(path.parent, f".{path.stem}.tmp-", path.suffix)
 
@@ -167,6 +193,9 @@ def scratch_directory(path: Path) -> Iterator[Path]:
     temporary.mkdir()
     try:
         yield temporary
+    except Exception as error:
+        _find_cause(error, path.parent)
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

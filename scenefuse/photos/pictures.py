@@ -56,16 +56,17 @@ def write_picture(path: Path, pixels: NDArray[np.uint8]) -> None:
     """Write (H, W) grey or (H, W, 3) RGB pixels in the format of the path's suffix.
 
     Raises:
-        StageError: OpenCV could not write the file: a full disk, or a suffix it does not know.
+        StageError: OpenCV does not know the suffix.
+        OSError: the file could not be written. (OpenCV itself writes a part of it on a full disk, and says nothing.)
     """
+    path = Path(path)
     stored = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if Path(path).suffix.lower() in (".jpg", ".jpeg") else []
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if path.suffix.lower() in (".jpg", ".jpeg") else []
     try:
-        written = cv2.imwrite(str(path), stored, options)
+        content = cv2.imencode(path.suffix, stored, options)[1]
     except cv2.error:
-        written = False
-    if not written:
-        raise StageError(f"{path} could not be written; check that the disk has room, and the file's ending")
+        raise StageError(f"{path} has an ending of no known picture; give .png or .jpg") from None
+    path.write_bytes(content)
 
 
 def _read(path: Path, flags: int) -> NDArray[Any]:

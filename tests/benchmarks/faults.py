@@ -5,6 +5,7 @@ PYTHONPATH=.:tests python tests/benchmarks/faults.py workflow --table T.tsv [--o
 PYTHONPATH=.:tests python tests/benchmarks/faults.py stages --finished FOLDER --table T.tsv
 """
 
+import contextlib
 import csv
 import os
 import re
@@ -14,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import tyro
@@ -46,6 +47,9 @@ STAGES = {
     "report": ("write_report-all", "report/write_report.py", "view.ply"),
 }
 MEMORY_LIMIT_KB = 700_000
+ENOUGH = {"no memory": "the limit is enough", "full disk": "the room is enough"}
+# Room on a full disk: of a stage, for its log; of a run, for what it needs to begin.
+STAGE_ROOM_KB, RUN_ROOM_KB = 16, 40_000
 
 
 def table_of(path: Path, rows: list[dict[str, str]]) -> None:
@@ -60,12 +64,13 @@ def table_of(path: Path, rows: list[dict[str, str]]) -> None:
         writer.writerows(kept)
 
 
-def workflow(*, table: Path, only: tuple[str, ...] = tuple(STAGES)) -> int:
+def workflow(*, table: Path, only: tuple[str, ...] = tuple(STAGES), faults: tuple[str, ...] = ()) -> int:
     """Faults of the workflow: stages are stubs. Every one is the same run, in which the code of a stage was changed.
 
     Args:
         table: output; rows of other stages stay.
         only: stages that are tried.
+        faults: faults that are tried; all without any.
     """
     failed = 0
     with tempfile.TemporaryDirectory(prefix="faults-") as place:
@@ -85,8 +90,11 @@ def workflow(*, table: Path, only: tuple[str, ...] = tuple(STAGES)) -> int:
 
             undisturbed = start("undisturbed")
             assert undisturbed.run().returncode == 0
-            faults = {"SIGKILL of the job": _killed, "power cut": _power_cut} | EXTRA.get(stage, {})
-            for fault, happen in faults.items():
+            happenings = {"SIGKILL of the job": _killed, "power cut": _power_cut, "full disk": _full_disk}
+            happenings |= {"read-only results": _no_writing} | EXTRA.get(stage, {})
+            for fault, happen in happenings.items():
+                if faults and fault not in faults:
+                    continue
                 run = start("disturbed")
                 end = happen(run, job)
                 again = run.run()
@@ -107,11 +115,11 @@ def _said(output: str) -> str:
         r"^failed: (.*)$",
         r"^(the run before .*)$",
         r"^Error: (.*)$",
-        r"^\w*(?:Exception|Error)[^\n]*:\n(.*)$",
+        r"^\w*(?:Exception|Error)[^\n]*:\n(.*(?:\n .*)*)$",
     ):
         found = re.search(pattern, output, re.MULTILINE)
         if found:
-            return _short(found[1])
+            return _short(" ".join(found[1].split()))
     return "resumed"
 
 
@@ -134,6 +142,61 @@ def _power_cut(run: StubRun, job: str) -> str:
     run.run()
     run.plant(job, "")
     return _said(run.run().stdout)
+
+
+@contextlib.contextmanager
+def _no_room(path: Path, room_kb: int) -> Iterator[None]:
+    """A folder on a disk of its own, in memory, with so much free; its content stays afterwards. Only root may."""
+    aside = path.with_name(f"{path.name}.aside")
+    shutil.copytree(path, aside, symlinks=True)
+    with _mounted(path, "-t", "tmpfs", "tmpfs"):
+        shutil.copytree(aside, path, symlinks=True, dirs_exist_ok=True)
+        shutil.rmtree(aside)
+        used_kb = shutil.disk_usage(path).used // 1024
+        subprocess.run(["mount", "-o", f"remount,size={used_kb + room_kb}k", str(path)], check=True)
+        yield
+        shutil.copytree(path, aside, symlinks=True)
+    shutil.rmtree(path)
+    aside.rename(path)
+
+
+@contextlib.contextmanager
+def _read_only(folders: set[Path]) -> Iterator[None]:
+    """Folders that nobody can write to, root neither."""
+    with contextlib.ExitStack() as mounts:
+        for folder in folders:
+            mounts.enter_context(_mounted(folder, "--bind", str(folder)))
+            subprocess.run(["mount", "-o", "remount,bind,ro", str(folder)], check=True)
+        yield
+
+
+@contextlib.contextmanager
+def _mounted(path: Path, *what: str) -> Iterator[None]:
+    subprocess.run(["mount", *what, str(path)], check=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "-l", str(path)], check=True)
+
+
+def _full_disk(run: StubRun, job: str) -> str:
+    """Another program takes all that is free while the stage works; afterwards it gives it back."""
+    filler = run.path / "filler"
+    run.plant(job, f"run cat /dev/zero 2> /dev/null > {filler}")
+    with _no_room(run.path, RUN_ROOM_KB):
+        said = _said(run.run().stdout)
+        filler.unlink(missing_ok=True)
+    run.plant(job, "")
+    return said
+
+
+def _no_writing(run: StubRun, job: str) -> str:
+    """The folders that a stage writes to are read-only."""
+    run.plant(job, "run true")
+    with _read_only({(run.path / path).parent for path in run.outputs_of(job)}):
+        said = _said(run.run().stdout)
+    run.plant(job, "")
+    return said
 
 
 def _stopped(run: StubRun, job: str) -> str:
@@ -246,7 +309,7 @@ EXTRA: dict[str, dict[str, Callable[[StubRun, str], str]]] = {
 }
 
 
-def stages(*, finished: Path, table: Path, only: tuple[str, ...] = tuple(STAGES)) -> int:
+def stages(*, finished: Path, table: Path, only: tuple[str, ...] = tuple(STAGES), faults: tuple[str, ...] = ()) -> int:
     """Faults of the stages themselves: the commands of a finished run of the tiny workflow.
 
     Each must end in one sentence, change no output and leave nothing hidden.
@@ -255,48 +318,51 @@ def stages(*, finished: Path, table: Path, only: tuple[str, ...] = tuple(STAGES)
         finished: folder of the run.
         table: output; rows of other stages stay.
         only: stages that are tried.
+        faults: faults that are tried; all without any.
     """
     failed = 0
     with tempfile.TemporaryDirectory(prefix="faults-") as place:
         work = Path(place) / "run"
         subprocess.run(["cp", "-a", "--reflink=auto", str(finished), str(work)], check=True)
-        os.chdir(work)
-        records = FilePersistence(path=work / ".snakemake")
         for stage in only:
             job, _, cut = STAGES[stage]
-            rule = job.split("-")[0]
-            record, outputs = _recorded(records, work, rule)
+            record, outputs = _recorded(work, job.split("-")[0])
             before = {name: text for name, text in results_in(work).items() if _within(name, outputs)}
-            for fault, happen in (("input cut to half", _cut), ("input garbled", _garbled), ("no memory", None)):
-                spoiled = None if happen is None else _input(record.input, cut)
-                if happen is not None and spoiled is None:
-                    continue
-                limit = f"ulimit -v {MEMORY_LIMIT_KB}; " if happen is None else ""
-                content = spoiled.read_bytes() if spoiled else b""
-                if spoiled and happen:
-                    spoiled.write_bytes(happen(content))
-                status, said = _run_stage(record.shellcmd, limit)
-                if spoiled:
-                    spoiled.write_bytes(content)
+            happenings = {"no memory": contextlib.nullcontext()}
+            spoiled = _input([str(work / name) for name in record.input], cut)
+            if spoiled:
+                happenings |= {
+                    "input cut to half": _spoiled(spoiled, _cut),
+                    "input garbled": _spoiled(spoiled, _garbled),
+                }
+            happenings |= {
+                "full disk": _no_room(work, STAGE_ROOM_KB),
+                "read-only results": _read_only({(work / path).parent for path in outputs}),
+            }
+            for fault in happenings.keys() & set(faults) if faults else happenings:
+                limit = f"ulimit -v {MEMORY_LIMIT_KB}; " if fault == "no memory" else ""
+                with happenings[fault]:
+                    status, said = _run_stage(record.shellcmd, work, limit)
                 after = results_in(work)
                 # What a library's abort leaves goes when the stage runs again.
                 hidden = [name for name in after if ".tmp-" in name]
                 for name in hidden:
                     (work / "results" / name).unlink()
                 same = {name: text for name, text in after.items() if _within(name, outputs)} == before
-                enough = status == 0 and not spoiled
+                enough = status == 0 and fault in ("no memory", "full disk")
                 well = enough or (bool(said) and same)
                 failed += not well
-                end = said or ("the limit is enough" if enough else "SILENT" if status == 0 else "NO SENTENCE")
+                end = said or (ENOUGH[fault] if enough else "SILENT" if status == 0 else "NO SENTENCE")
                 row = (stage, fault, "real", _short(end), "outputs as before" if same else "made anew")
                 print(*row, *hidden, sep=" | ", flush=True)
                 table_of(table, [dict(zip(COLUMNS, row))])
     return failed
 
 
-def _recorded(records: FilePersistence, work: Path, rule: str):
+def _recorded(work: Path, rule: str):
     """Snakemake's record of a job of a rule, and its outputs."""
-    outputs, found = [], None
+    records = FilePersistence(path=work / ".snakemake")
+    outputs, found = list[str](), None
     for file in sorted((work / ".snakemake/metadata").rglob("*")):
         if file.is_file():
             name = _decoded(file, work / ".snakemake/metadata")
@@ -335,6 +401,14 @@ def _input(inputs: list[str], cut: str) -> Path | None:
     return None
 
 
+@contextlib.contextmanager
+def _spoiled(file: Path, change: Callable[[bytes], bytes]) -> Iterator[None]:
+    content = file.read_bytes()
+    file.write_bytes(change(content))
+    yield
+    file.write_bytes(content)
+
+
 def _cut(content: bytes) -> bytes:
     return content[: len(content) // 2]
 
@@ -344,12 +418,12 @@ def _garbled(content: bytes) -> bytes:
     return bytes(255 - byte if index % 2 and index < 100 else byte for index, byte in enumerate(content))
 
 
-def _run_stage(command: str, limit: str) -> tuple[int, str]:
+def _run_stage(command: str, work: Path, limit: str) -> tuple[int, str]:
     """Exit status of a stage, and the sentence that its log ends in; "" where that is none."""
-    log = Path(re.search(r"&> (\S+)", command)[1])  # type: ignore[index]
+    log = work / re.search(r"&> (\S+)", command)[1]  # type: ignore[index]
     env = os.environ | {"SCENEFUSE": str(ROOT), "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     times = log.stat()
-    done = subprocess.run(["bash", "-c", limit + command.strip()], env=env)
+    done = subprocess.run(["bash", "-c", limit + command.strip()], cwd=work, env=env)
     text, said = log.read_text(errors="replace"), last_error(log)
     os.utime(log, (times.st_atime, times.st_mtime))
     if "Traceback" in text and "memory" not in said:

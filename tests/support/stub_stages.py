@@ -41,6 +41,18 @@ own = pathlib.Path(__file__).read_bytes()
 digest = hashlib.sha256(" ".join(words).encode() + read + own).hexdigest()
 if fault == "error":
     sys.exit("error: planted")
+if fault.startswith("run "):
+    # As a stage writes, and says that it cannot.
+    from scenefuse.core.stage import atomic_file, run
+
+    def write():
+        os.system(fault.removeprefix("run "))
+        path = pathlib.Path(outputs[0])
+        with atomic_file(path / "part" if path.suffix == "" else path) as temporary:
+            temporary.write_bytes(bytes(100_000))
+
+    sys.argv = sys.argv[:1]
+    run(write)
 if fault.startswith("sleep "):
     pathlib.Path(log).with_suffix(".started").touch()
     try:

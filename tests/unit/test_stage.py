@@ -1,10 +1,12 @@
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -96,6 +98,41 @@ def test_a_full_disk_is_one_sentence(tmp_path, monkeypatch, capsys):
         run(stage)
     assert capsys.readouterr().err == "error: the disk is full (a.txt); free some space and run this again\n"
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("made", [atomic_file, atomic_directory])
+def test_a_full_disk_and_a_folder_that_is_read_only_are_named_where_a_library_says_something_else(
+    tmp_path, monkeypatch, capsys, made
+):
+    def stage() -> None:
+        """Fail as SQLite does."""
+        with made(tmp_path / "a.db"):
+            raise RuntimeError("No registered database factory succeeded.")
+
+    monkeypatch.setattr(sys, "argv", ["stage"])
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    with pytest.raises(RuntimeError, match="factory"):
+        run(stage)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10_000))
+    with pytest.raises(SystemExit):
+        run(stage)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(SystemExit):
+        run(stage)
+    full, frozen = capsys.readouterr().err.splitlines()
+    assert full == f"error: the disk is full ({tmp_path}); free some space and run this again"
+    assert frozen == f"error: {tmp_path}: read-only file system; check the folder and who may write there"
+
+
+def test_what_cannot_be_written_is_named_without_its_temporary_name(monkeypatch, capsys):
+    def stage() -> None:
+        """Write where nobody may."""
+        raise OSError(errno.EROFS, "Read-only file system", "results/objects/house/.stage1.tmp-12/a.bin")
+
+    monkeypatch.setattr(sys, "argv", ["stage"])
+    with pytest.raises(SystemExit, match="1"):
+        run(stage)
+    assert capsys.readouterr().err.startswith("error: results/objects/house: read-only file system; check the folder")
 
 
 def test_too_little_memory_is_one_sentence(monkeypatch, capsys):

@@ -18,12 +18,10 @@ from scenefuse.core.project import read_project
 from scenefuse.core.settings import PACKAGE, ROOT as SHIPPED
 from scenefuse.core.machine import has_gpu, megapixels, memory_mb
 from scenefuse.photos.photo_files import GEO_FILE, camera_files, photo_files
-from scenefuse.core.stage import StageError
+from scenefuse.core.stage import DISK_FULL, MIN_FREE_BYTES, StageError
 
 # A file that a run holds until it ends, among Snakemake's locks and removed with them.
 RUN_LOCK = Path(".snakemake/locks/run")
-# Records of the jobs and logs take so much at least.
-MIN_FREE_BYTES = 2**20
 
 # The folder above workflow/; where another workflow has fetched this one from the web, that of the installed library.
 if workflow.modifier.path_modifier.replace_prefix("results") != "results":
@@ -36,10 +34,11 @@ if set("{}") & set(os.getcwd()):
         f"Snakemake takes the braces in {os.getcwd()} for wildcards; rename the folder, or work in another one"
     )
 # Snakemake itself, and its log of an error, would end in tracebacks.
+for folder in filter(os.path.exists, (os.getcwd(), ".snakemake", "results")):
+    if not os.access(folder, os.W_OK):
+        sys.exit(f"error: {folder} cannot be written to; check who may write there")
 if shutil.disk_usage(os.getcwd()).free < MIN_FREE_BYTES:
-    sys.exit(
-        f"error: the disk of {os.getcwd()} is full; free some space and run this again"
-    )
+    sys.exit("error: " + DISK_FULL.format(f" ({os.getcwd()})"))
 ROOT = Path(str(workflow.current_basedir)).parents[1]
 if not (ROOT / "scripts").is_dir():
     ROOT = SHIPPED
