@@ -84,18 +84,24 @@ def readable(path: Path) -> Iterator[None]:
     Raises:
         StageError: the file is empty, or cannot be read.
     """
-    if path.is_file() and path.stat().st_size == 0:
-        raise StageError(f"{path} is empty (0 bytes); copy or export it again")
     try:
+        if path.is_file() and path.stat().st_size == 0:
+            raise StageError(f"{path} is empty (0 bytes); copy or export it again")
         yield
-    except (StageError, MemoryError):
+    except MemoryError:
         raise
     except Exception as error:  # each library has its own errors for a damaged file
-        kind = path.suffix.removeprefix(".").upper()
-        why = ((str(error) or type(error).__name__).splitlines() or ["?"])[0][:200]
-        # What this package itself says of a strange file is a ValueError.
-        cut = "" if isinstance(error, ValueError) else "copy it again, for it may be cut short, or "
-        raise StageError(f"{path} is not a readable {kind} cloud ({why}); {cut}export it again") from None
+        said = str(error)
+        if not isinstance(error, StageError):
+            kind = path.suffix.removeprefix(".").upper()
+            why = ((said or type(error).__name__).splitlines() or ["?"])[0][:200]
+            # What this package itself says of a strange file is a ValueError.
+            cut = "" if isinstance(error, ValueError) else "copy it again, for it may be cut short, or "
+            said = f"{path} is not a readable {kind} cloud ({why}); {cut}export it again"
+        # What the workflow made, it makes again.
+        if path.parts[:1] == ("results",):
+            said = f"{said.rpartition('; ')[0]}; delete it and run again"
+        raise StageError(said) from None
 
 
 def _checked(path: Path, columns: Columns) -> Columns:

@@ -2,6 +2,7 @@
 right."""
 
 import struct
+from pathlib import Path
 
 import laspy
 import numpy as np
@@ -118,6 +119,22 @@ def test_a_cut_file_is_told_from_a_strange_one(tmp_path, name, content, sentence
     (tmp_path / name).write_text(content)
     with pytest.raises(StageError, match=sentence):
         read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize("content", ["", "ply\n", HEAD.format(41) + "end_header\n" + "\n".join(rows())])
+def test_of_a_damaged_cloud_that_the_workflow_made_it_is_said_that_it_will_be_made_again(
+    tmp_path, monkeypatch, content
+):
+    monkeypatch.chdir(tmp_path)
+    for path, advice in (
+        (Path("results/object.ply"), "delete it and run again"),
+        (Path("own.ply"), "(copy|export|copy or export) it"),
+    ):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(content)
+        with pytest.raises(StageError, match=rf"^{path}[^;]*; {advice}") as error:
+            read_cloud(path)
+        assert ("delete" in str(error.value)) == path.is_relative_to("results")
 
 
 @pytest.mark.parametrize(
