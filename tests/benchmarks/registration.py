@@ -6,7 +6,7 @@ PYTHONPATH=tests python tests/benchmarks/registration.py --trials 28 --coverages
 
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
@@ -129,6 +129,14 @@ def planted(name: str, coverage: float, repeat: int) -> tuple[Trial, Cloud, dict
     trial = plant(name, seed, coverage=coverage, object_points=12000, **drawn)
     cut = crop_cloud(trial.scene, trial.fiducials, UP, CropSettings())
     return trial, trial.scene[cut.keep], drawn
+
+
+def mirrored(trial: Trial) -> Trial:
+    """The same trial with the object's mirror image: no pose is right."""
+    flip, cloud = np.array([-1.0, 1, 1]), trial.object
+    assert cloud.normals is not None
+    cloud = replace(cloud, points=cloud.points * flip, normals=cloud.normals * flip.astype(np.float32))
+    return replace(trial, object=cloud, up_in_object=trial.up_in_object * flip)
 
 
 def one(task: tuple[str, float, int, list[str]]) -> list[dict[str, Any]]:

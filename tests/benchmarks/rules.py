@@ -3,12 +3,18 @@
 PYTHONPATH=tests python tests/benchmarks/rules.py run --part clouds --trials 0 1 2
 PYTHONPATH=tests python tests/benchmarks/rules.py table --part clouds --table docs/results/rules_registration.tsv
 
+With --numbers register geometry it halves and doubles the named numbers of those packages instead, one at a time;
+`numbers` makes the table of that.
+
 A part is a module `rules_of.PART` with `RULES`, a list of `Rule`, `TRIALS`, how many there are, and `evaluate(trial,
 rule)`, which returns what it measures by name, the rule being switched off already: counts (integers) are added up over
 the trials, of other numbers the median is taken, and the names `kind` and `reason` are for words.
 """
 
+import ast
 import importlib
+import pkgutil
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -31,12 +37,14 @@ class Rule:
         where: dotted path of what is replaced, in the module that uses it.
         change: what stands there without the rule, from what stands there with it.
         decided: what became of it, the table's last column.
+        everywhere: whether modules that import it have it replaced, too.
     """
 
     name: str
     where: str
     change: Callable[[Any], Any]
     decided: str = "kept"
+    everywhere: bool = False
 
 
 @contextmanager
@@ -45,11 +53,61 @@ def without(rule: Rule) -> Iterator[None]:
     owner, _, name = rule.where.rpartition(".")
     holder = _imported(owner)
     before = holder.__dict__[name]
-    setattr(holder, name, rule.change(before))
+    holders = [holder]
+    if rule.everywhere:
+        loaded = [m for key, m in list(sys.modules.items()) if key.startswith("scenefuse.") and m is not holder]
+        holders += [m for m in loaded if m.__dict__.get(name) is before and name not in _literals(m)]
+    for changed in holders:
+        setattr(changed, name, rule.change(before))
     try:
         yield
     finally:
-        setattr(holder, name, before)
+        for changed in holders:
+            setattr(changed, name, before)
+
+
+def numbers_of(package: str) -> Iterator[Rule]:
+    """Each named number of a package, or of a module PACKAGE.MODULE, halved and doubled."""
+    found = _imported(f"scenefuse.{package}")
+    paths = [m.name for m in pkgutil.iter_modules(found.__path__, f"{found.__name__}.")] if "." not in package else []
+    for module in [_imported(path) for path in paths] or [found]:
+        for name in _literals(module):
+            for word, change in (("halved", _halved), ("doubled", _doubled)):
+                where = f"{module.__name__}.{name}"
+                yield Rule(f"{where.removeprefix('scenefuse.')} {word}", where, change, everywhere=True)
+
+
+def _literals(module: Any) -> list[str]:
+    """Names of a module's constants that are numbers, or tuples of numbers, and are written down as such."""
+    tree = ast.parse(Path(module.__file__).read_text())
+    names = []
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            if not any(isinstance(c, ast.Constant) and isinstance(c.value, int | float) for c in ast.walk(node.value)):
+                continue
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                names += [n.id for n in ast.walk(target) if isinstance(n, ast.Name) and n.id.isupper()]
+    return [name for name in names if _is_number(module.__dict__[name])]
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, tuple):
+        return all(map(_is_number, value))
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _halved(value: Any) -> Any:
+    """Half of a number or of each in a tuple; integers stay integers from 1 on."""
+    if isinstance(value, tuple):
+        return tuple(map(_halved, value))
+    return value / 2 if isinstance(value, float) else max(value // 2, 1)
+
+
+def _doubled(value: Any) -> Any:
+    """Twice a number or each in a tuple; of a share above a half, what it lacks to 1 is halved instead."""
+    if isinstance(value, tuple):
+        return tuple(map(_doubled, value))
+    return (1 + value) / 2 if isinstance(value, float) and 0.5 <= value < 1 else 2 * value
 
 
 def _imported(path: str) -> Any:
@@ -66,6 +124,7 @@ def run(
     part: str,
     trials: tuple[int, ...] = (),
     rules: tuple[str, ...] = (),
+    numbers: tuple[str, ...] = (),
     out: Path = Path("results/bench/rules.tsv"),
 ) -> None:
     """Run trials with all rules, then without each; rows are added to a TSV, so that runs can be split up.
@@ -74,10 +133,12 @@ def run(
         part: name of the module in `rules_of`.
         trials: their numbers; all of the part without it.
         rules: parts of names of rules; all without it.
+        numbers: packages, or modules PACKAGE.MODULE, the numbers of which are tried instead of the part's rules.
         out: one row a trial and rule (TSV); what it holds already is not run again.
     """
     module = importlib.import_module(f"rules_of.{part}")
-    chosen = [r for r in module.RULES if not rules or any(name in r.name for name in rules)]
+    tried = [rule for package in numbers for rule in numbers_of(package)] or module.RULES
+    chosen = [r for r in tried if not rules or any(name in r.name for name in rules)]
     known = set() if not out.is_file() else {(r.rule, r.trial) for r in pd.read_csv(out, sep="\t").itertuples()}
     out.parent.mkdir(parents=True, exist_ok=True)
     for trial in trials or range(module.TRIALS):
@@ -122,5 +183,33 @@ def table(*, part: str, out: Path = Path("results/bench/rules.tsv"), table: Path
     print(result.drop(columns="where").to_string())
 
 
+def numbers(*, out: tuple[Path, ...], table: Path) -> None:
+    """Make the table of numbers: in how many trials a count changes, and by how much the other measures do at most.
+
+    Args:
+        out: the rows of `run --numbers`, a file a part.
+        table: output TSV.
+    """
+    lines = []
+    for path in out:
+        rows = pd.read_csv(path, sep="\t")
+        rows[["number", "change"]] = rows.rule.str.rsplit(" ", n=1, expand=True)
+        measures = rows.columns.drop(["rule", "trial", "kind", "reason", "cpu_s", "number", "change"], errors="ignore")
+        counts = [name for name in measures if pd.api.types.is_integer_dtype(rows[name])]
+        others = [name for name in measures if name not in counts]
+        whole = rows[rows.rule == NONE].set_index("trial")
+        for number, own in rows[rows.rule != NONE].groupby("number", sort=False):
+            line = {"part": path.stem, "number": number, "trials": own.trial.nunique()}
+            for change in ("halved", "doubled"):
+                some = own[own.change == change].set_index("trial")
+                before = whole.loc[some.index]
+                line[f"counts differ, {change}"] = int((some[counts] != before[counts]).any(axis=1).sum())
+                most = (some[others] - before[others]).abs().max()
+                line |= {f"{name}, {change}": f"{value:.2g}" for name, value in most.items()}
+            lines.append(line)
+    pd.DataFrame(lines).to_csv(table, sep="\t", index=False)
+    print(pd.DataFrame(lines).to_string())
+
+
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"run": run, "table": table})
+    tyro.extras.subcommand_cli_from_dict({"run": run, "table": table, "numbers": numbers})

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from benchmarks.registration import planted, scenefuse
+from benchmarks.registration import mirrored, planted, scenefuse
 from support.planted import SHAPES, errors
 
 NAMES = list(SHAPES)
@@ -29,10 +29,7 @@ def one(name: str, kind: str, coverage: float, repeat: int) -> dict[str, object]
         other, scene, _ = planted(NAMES[(NAMES.index(name) + 3) % len(NAMES)], coverage, repeat)
         trial = replace(trial, free_space=other.free_space)
     if kind == "mirrored":
-        flip, cloud = np.array([-1.0, 1, 1]), trial.object
-        assert cloud.normals is not None
-        cloud = replace(cloud, points=cloud.points * flip, normals=cloud.normals * flip.astype(np.float32))
-        trial = replace(trial, object=cloud, up_in_object=trial.up_in_object * flip)
+        trial = mirrored(trial)
     start = time.process_time()
     found = scenefuse(trial, scene, blind=kind == "shape")
     seconds = time.process_time() - start

@@ -1,7 +1,8 @@
 """The rules of registration by clouds, on planted trials: the pose is right, refused, or wrong and accepted.
 
 Trials are of four kinds in turn: with all evidence, by shape alone (no gravity, colours or depth maps), with all
-evidence where the scene shows more, and another object's scene, in which every pose is wrong.
+evidence where the scene shows more, and another object's scene, in which every pose is wrong. After these come mirrored
+objects, of which every pose is wrong, too.
 """
 
 from dataclasses import replace
@@ -9,7 +10,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from registration import ROTATION_DEG, SCALE_PCT, SHIFT, planted
+from registration import ROTATION_DEG, SCALE_PCT, SHIFT, mirrored, planted
 from rules import Rule, without
 from support.planted import SHAPES, errors
 
@@ -26,14 +27,15 @@ from scenefuse.register.uncertainty import Uncertainty
 UP = np.array([0.0, 0.0, 1.0])
 NAMES = list(SHAPES)
 KINDS = ("all evidence, 30 % shown", "shape alone, 70 % shown", "all evidence, 50 % shown", "absent")
-TRIALS = len(KINDS) * len(NAMES)
+MIRRORED = "mirrored"
+TRIALS = (len(KINDS) + 1) * len(NAMES)
 # Less work than by default, so that many rules can be tried.
 COARSE = CoarseSettings(ransac_samples=10000, scale_steps=9, yaw_steps=16, candidates=12, keep=4)
 LITTLE: dict[str, Any] = {"voxel_fraction": 0.012, "turn_steps": 12}
 R, G = "scenefuse.register", "scenefuse.geometry"
 # Rules of these modules leave the candidates as they are.
 AFTER_CANDIDATES = (
-    *(f"{R}.{name}." for name in ("refinement", "likelihood", "uncertainty")),
+    *(f"{R}.{name}." for name in ("refinement", "likelihood", "uncertainty", "repetition", "decision")),
     f"{G}.icp._without_overhang", f"{G}.icp.POINT_WEIGHT",
 )  # fmt: skip
 
@@ -42,13 +44,21 @@ AFTER_CANDIDATES = (
 def trial_of(number: int) -> tuple[Any, Cloud, str]:
     """A planted trial, its crop, and its kind."""
     kind, repeat = KINDS[number % len(KINDS)], number // len(KINDS)
-    name = NAMES[repeat % len(NAMES)]
-    coverage = {KINDS[0]: 0.3, KINDS[1]: 0.7, KINDS[2]: 0.5, KINDS[3]: 0.7}[kind]
-    trial, scene, _ = planted(name, coverage, repeat)
+    if repeat >= len(NAMES):
+        kind, repeat = MIRRORED, number % len(NAMES)
+    coverage = {KINDS[0]: 0.3, KINDS[1]: 0.7, KINDS[2]: 0.5, KINDS[3]: 0.7, MIRRORED: 0.7}[kind]
+    trial, scene, _ = planted(_name(number), coverage, repeat)
+    if kind == MIRRORED:
+        trial = mirrored(trial)
     if kind == KINDS[3]:
         other, scene, _ = planted(NAMES[(repeat + 3) % len(NAMES)], coverage, repeat)
         trial = replace(trial, free_space=other.free_space)
     return trial, scene, kind
+
+
+def _name(number: int) -> str:
+    """The shape of a trial."""
+    return NAMES[number // len(KINDS)] if number < len(KINDS) * len(NAMES) else NAMES[number % len(NAMES)]
 
 
 def evaluate(number: int, rule: Rule | None) -> dict[str, Any]:
@@ -105,9 +115,9 @@ def _outcome(number: int, found: list[Hypothesis]) -> tuple[dict[str, Any], tupl
 def _rated(number: int, pose: Sim3, stated: Uncertainty | None, found: decision.Decision) -> dict[str, Any]:
     """A pose and its decision beside the truth."""
     trial, _, kind = trial_of(number)
-    axis = UP if SHAPES[NAMES[number // len(KINDS) % len(NAMES)]].round else trial.axis
+    axis = UP if SHAPES[_name(number)].round else trial.axis
     scale, angle, shift = errors(pose, trial.scene_from_object, trial.object.points.mean(0), trial.diagonal, axis)
-    if kind == KINDS[3] or abs(scale) > SCALE_PCT or angle > ROTATION_DEG or shift > SHIFT:
+    if kind in (KINDS[3], MIRRORED) or abs(scale) > SCALE_PCT or angle > ROTATION_DEG or shift > SHIFT:
         return _measured(number, False, found.registered, found.reason)
     over = np.nan if stated is None else abs(np.log(1 + scale / 100)) / max(stated.scale_sd_log, 1e-9)
     return _measured(number, True, found.registered, found.reason, abs(scale), angle, 100 * shift, over)
