@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import quantity, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.geometry.alignment_picture import draw_alignment
 from scenefuse.geometry.icp import ScaleRange, triples_of_one_scale
+from scenefuse.register.agreement import draw_alignment
 from scenefuse.register.coarse import COARSE_POINTS, coarse_quantities
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.fine import ledger_row, pose_quantities

@@ -1,18 +1,23 @@
-"""How well a registered object and the scene crop agree: fitness, RMSE, normals, F-score (method R10, R11, G1)."""
+"""How well a registered object and the scene crop agree: in numbers (method R10, R11, G1) and in a picture."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, plane_normals, sampled, spacing
-from scenefuse.core.stage import quantity, threads
+from scenefuse.core.stage import atomic_file, quantity, threads
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
+from scenefuse.photos.pictures import write_picture
 
-# Points at which the normals of both clouds together are compared with their neighbours'.
-MAX_COMPARED_POINTS = 20000
+# Points of each cloud that are drawn, and at which normals are compared with their neighbours'.
+SAMPLED_POINTS = 20_000
+# Of each of the picture's six views.
+SIDE_PX = 460
 
 
 @dataclass(frozen=True)
@@ -68,9 +73,9 @@ def registration_metrics(
 def self_consistency(points: Array) -> float:
     """Mean |n . n'| between points (N, 3) and their neighbours: how smooth a surface is, whatever it is of (method G1).
 
-    Measured at MAX_COMPARED_POINTS points at most; neighbours and normals are those of the whole cloud.
+    Measured at SAMPLED_POINTS points at most; neighbours and normals are those of the whole cloud.
     """
-    tree, at = cKDTree(points), sampled(points, MAX_COMPARED_POINTS, seed=0)
+    tree, at = cKDTree(points), sampled(points, SAMPLED_POINTS, seed=0)
     neighbours = tree.query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
     used, place = np.unique(neighbours, return_inverse=True)
     normals = _normals(points, points[used])[place.reshape(neighbours.shape)]
@@ -81,3 +86,37 @@ def _normals(points: Array, at: Array) -> Array:
     """Normals (M, 3) of the planes through the points (N, 3) nearest to each of `at` (M, 3)."""
     neighbours = cKDTree(points).query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
     return plane_normals(points, neighbours)
+
+
+def draw_alignment(path: Path, cloud: Cloud, scene: Cloud, scene_from_object: Sim3, seed: int) -> None:
+    """Write a PNG: top, front and side views; above in two colours (scene grey, object orange), below as measured."""
+    rng = np.random.default_rng(seed)
+    obj, ground = (c[np.sort(rng.permutation(len(c))[:SAMPLED_POINTS])] for c in (cloud, scene))
+    obj = obj.transformed(scene_from_object)
+    # Strays at either side do not count.
+    ends = np.array([np.percentile(each.points, [0.5, 99.5], axis=0) for each in (obj, ground)])
+    low, high = ends[:, 0].min(0), ends[:, 1].max(0)
+    points, half = np.concatenate([ground.points, obj.points]) - (low + high) / 2, 0.62 * float((high - low).max())
+    flat, real = [], []
+    for each, color in ((ground, (60, 60, 60)), (obj, (214, 92, 30))):
+        flat.append(np.tile(color, (len(each), 1)))
+        real.append(flat[-1] if each.colors is None else each.colors)
+    views = (0, 1), (0, 2), (1, 2)
+    rows = [
+        np.concatenate([_splat(points, np.concatenate(colors), *axes, half) for axes in views], axis=1)
+        for colors in (flat, real)
+    ]
+    with atomic_file(path) as temporary:
+        write_picture(temporary, np.concatenate(rows))
+
+
+def _splat(points: Array, colors: NDArray[Any], right: int, up: int, half: float) -> NDArray[np.uint8]:
+    """Points with two axes to the right and up, the nearest drawn last, on white."""
+    order = np.argsort(points @ np.cross(*np.eye(3)[[right, up]]), kind="stable")
+    at = np.stack([1 - points[order, up] / half, points[order, right] / half + 1]) / 2 * SIDE_PX
+    inside = ((at > 0) & (at < SIDE_PX - 1)).all(0)
+    rows, columns = at[:, inside].astype(int)
+    image = np.full((SIDE_PX, SIDE_PX, 3), 255, np.uint8)
+    for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        image[rows + dv, columns + du] = colors[order][inside]
+    return image

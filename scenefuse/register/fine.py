@@ -10,9 +10,9 @@ import numpy as np
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.geometry.alignment_picture import draw_alignment
 from scenefuse.geometry.depth_test import FreeSpace, read_free_space
 from scenefuse.geometry.icp import ScaleRange
+from scenefuse.register.agreement import draw_alignment
 from scenefuse.register.coarse import Candidate
 from scenefuse.register.decision import DecidedBy, FineSettings, tilt_deg
 from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, read_alignment

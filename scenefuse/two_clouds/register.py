@@ -20,8 +20,8 @@ from scenefuse.core.settings import ROOT
 from scenefuse.core.stage import StageError, atomic_file, quantity, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.core.version import VERSION
-from scenefuse.geometry.alignment_picture import draw_alignment
 from scenefuse.geometry.icp import ScaleRange
+from scenefuse.register.agreement import draw_alignment
 from scenefuse.register.register import (
     Known,
     Registration,
