@@ -12,7 +12,7 @@ from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.geometry.icp import ScaleRange, refine_planes
 from scenefuse.geometry.surface import Surface, with_queries
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.likelihood import MIN_PIECES, PIECES_ACROSS
+from scenefuse.register.likelihood import PIECES_ACROSS
 from scenefuse.register.uncertainty import Uncertainty
 
 # Pairs within these shares of the diagonal, one after the other: an object a few per cent off still settles. One that
@@ -102,7 +102,7 @@ def half_sampling(
         seed: of the halves.
 
     Returns:
-        None with fewer than MIN_PIECES pieces to draw from.
+        None with no more pieces to draw from than a pose has parameters.
     """
     centre, rng = obj.points.mean(0), np.random.default_rng(seed)
     edge = float(np.linalg.norm(np.ptp(scene.points, axis=0))) / PIECES_ACROSS
@@ -129,7 +129,7 @@ def _half(
     piece = np.unique(np.floor(places / edge).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
     in_scene, in_object = piece[: len(scene)], piece[len(scene) :]
     pieces = np.unique(in_scene)
-    if len(pieces) < MIN_PIECES:
+    if len(pieces) <= 7:
         return None
     chosen = np.zeros(piece.max() + 1, dtype=bool)
     chosen[rng.permutation(pieces)[: len(pieces) // 2]] = True

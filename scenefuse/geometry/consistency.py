@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.depth_test import Where, place
+from scenefuse.geometry.photo_check import MAX_PHOTOS
 from scenefuse.photos.workspace import View
-
-# Views that a view is compared with at most: what more photos cost then grows with them, not with their square.
-MAX_VIEWS = 64
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,8 @@ class DepthAgreement:
 def others(view: int, frame_from_cam: Array) -> NDArray[np.int64]:
     """Indices of the views that `view` is compared with: all others, of many the near ones and ever fewer farther off.
 
-    Near views see the same surface, far ones see it from another side and have it in their outline.
+    Near views see the same surface, far ones see it from another side and have it in their outline. With MAX_PHOTOS at
+    most, what more photos cost grows with them, not with their square.
 
     Args:
         view: index of a view.
@@ -52,11 +51,11 @@ def others(view: int, frame_from_cam: Array) -> NDArray[np.int64]:
     centres = frame_from_cam[:, :3, 3]
     order = np.argsort(np.linalg.norm(centres - centres[view], axis=1), kind="stable")
     order = order[order != view]
-    if len(order) <= MAX_VIEWS:
+    if len(order) <= MAX_PHOTOS:
         return np.sort(order)
-    step = np.arange(MAX_VIEWS)
-    spare = len(order) - MAX_VIEWS
-    return np.sort(order[step + np.floor(spare * (step / (MAX_VIEWS - 1)) ** 2).astype(np.int64)])
+    step = np.arange(MAX_PHOTOS)
+    spare = len(order) - MAX_PHOTOS
+    return np.sort(order[step + np.floor(spare * (step / (MAX_PHOTOS - 1)) ** 2).astype(np.int64)])
 
 
 def back_project(

@@ -19,9 +19,8 @@ from scenefuse.photos.workspace import View
 
 # One grey level of 255, squared, the noise of a photo: keeps windows without texture from matching anything.
 NOISE_VARIANCE = 1.5e-5
-# Difference of grey values, 0..1, at which a pixel's weight in a support falls to 1 / e, and at which it ends: beside a
-# dark statue, the smallest weight is texture enough for a blank sky to match at the statue's depth.
-GREY_FALL, MAX_GREY_STEP = 0.07, 0.28
+# Difference of grey values, 0..1, at which a pixel's weight in a support falls to 1 / e.
+GREY_FALL = 0.07
 # Distance, in radii of the window, at which it falls to 1 / e.
 DISTANCE_FALL = 0.6
 # Score of a hypothesis outside a source photo: worse than a window that does not match.
@@ -167,9 +166,9 @@ def support_weights(gray: Tensor, window: int) -> Tensor:
         weights = []
         for k in range(window):
             step = (padded[k : k + len(values)] - values).abs()
-            weights.append(
-                torch.exp(-step / GREY_FALL - abs(k - radius) / (DISTANCE_FALL * radius)) * (step < MAX_GREY_STEP)
-            )
+            weight = torch.exp(-step / GREY_FALL - abs(k - radius) / (DISTANCE_FALL * radius))
+            # Beside a dark statue, the smallest weight is texture enough for a blank sky to match at its depth.
+            weights.append(weight * (step < 4 * GREY_FALL))
         stacked = torch.stack(weights, dim=1)
         stacked = (stacked / stacked.sum(1, keepdim=True)).transpose(0, 2 * axis)
         parts.append(stacked)

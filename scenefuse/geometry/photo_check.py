@@ -12,13 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.geometry.photo_kernel import OFFSETS, match_points
+from scenefuse.geometry.photo_kernel import CONFIRMING_PHOTOS, OFFSETS, match_points
 from scenefuse.photos.workspace import View, Workspace
 
 # Least weighted NCC of a photo that confirms a point, and by how much more another offset may score.
 MIN_MATCH, MAX_DROP = 0.6, 0.1
-# Photos that must confirm a point for it to be measured.
-CONFIRMING_PHOTOS = 3
 # Largest standard deviation of a measured point in steps along the ray, of about a pixel: windows that match as well
 # farther on measure nothing, sky and blank walls above all.
 MAX_DEVIATION_PX = 1.2

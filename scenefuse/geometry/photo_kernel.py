@@ -9,9 +9,11 @@ from numba import njit, prange
 RADIUS = 3
 # Steps before and behind the point that are matched too; a step moves a patch by about a pixel in the other photos.
 OFFSETS = 4
-# Photos at most that one point is compared in, beside its reference, and how many of them count at each offset: the
-# others may not see the place (Goesele et al. 2006).
-OTHERS, BEST = 10, 3
+# Photos at most that one point is compared in, beside its reference.
+OTHERS = 10
+# Photos that must confirm a point for it to be measured; as many of the others count at each offset, since the rest
+# may not see the place (Goesele et al. 2006).
+CONFIRMING_PHOTOS = 3
 # Grey levels over which a sample's weight falls: across an edge a patch does not mix two surfaces (Yoon, Kweon 2006).
 GREY_FALL = 25.0
 # Photos that look along a surface (beyond 75 degrees) show little of it.
@@ -28,7 +30,6 @@ NOISE = 1.5
 _REFERENCE_COSINE = math.cos(REFERENCE_ANGLE)
 _SIDE = 2 * RADIUS + 1
 _SAMPLES = _SIDE * _SIDE
-_STEPS = 2 * OFFSETS + 1
 
 
 @njit(error_model="numpy")
@@ -187,7 +188,7 @@ def _match(
     down_x, down_y, down_z = _turned(p, down[0], down[1], down[2])
     # Middle of the outermost pixel, and a little more: the corners are compared before the division, rounded otherwise.
     spread, least = 0.0, 0.5001
-    for j in range(_STEPS):
+    for j in range(len(ncc)):
         scale = 1.0 + (j - OFFSETS) * step
         mx, my, mz = base_x + scale * ray_x, base_y + scale * ray_y, base_z + scale * ray_z
         ax, ay, az = scale * across_x, scale * across_y, scale * across_z
@@ -263,7 +264,7 @@ def match_points(  # type: ignore[no-untyped-def]
         quality, cosine = np.zeros(views), np.zeros(views)
         chosen, angles, tried = np.zeros(OTHERS, np.int64), np.zeros(OTHERS), np.zeros(REFERENCES, np.int64)
         patch, weight = np.zeros(_SAMPLES, np.float32), np.zeros(_SAMPLES, np.float32)
-        samples, ncc = np.zeros((_STEPS, _SAMPLES), np.float32), np.zeros((OTHERS, _STEPS))
+        samples, ncc = np.zeros((curve.shape[1], _SAMPLES), np.float32), np.zeros((OTHERS, curve.shape[1]))
         information, at_offset, worth = np.zeros(OTHERS), np.zeros(OTHERS), np.zeros(OTHERS)
         for i in range(block * together, min((block + 1) * together, count)):
             curve[i], spread[i], tested[i], confirming[i], texture[i], step_length[i] = -1.0, np.inf, 0, 0, 0.0, 0.0
@@ -271,7 +272,7 @@ def match_points(  # type: ignore[no-untyped-def]
             _photos_of(point, normal, projections, centres, focals, sizes, quality, cosine)
             for attempt in range(REFERENCES):
                 ref = _next_reference(point, centres, quality, tried, attempt)
-                if ref < 0 or confirming[i] > BEST:
+                if ref < 0 or confirming[i] > CONFIRMING_PHOTOS:
                     break
                 tried[attempt] = ref
                 others = _choose(point, ref, centres, quality, chosen, angles, worth)
@@ -303,11 +304,11 @@ def match_points(  # type: ignore[no-untyped-def]
                 if seen < 2 or (tested[i] > 0 and agreeing + 1 <= confirming[i]):
                     continue
                 tested[i], texture[i], step_length[i] = seen, math.sqrt(variance), step
-                for j in range(_STEPS):
+                for j in range(curve.shape[1]):
                     at_offset[:others] = -ncc[:others, j]
                     at_offset[others:] = 1.0
                     order = np.sort(at_offset)
-                    curve[i, j] = -order[: min(BEST, seen)].mean()
+                    curve[i, j] = -order[: min(CONFIRMING_PHOTOS, seen)].mean()
                 if agreeing > 0:
                     confirming[i] = agreeing + 1
                     spread[i] = step / math.sqrt(known) if known > 0 else np.inf

@@ -29,11 +29,19 @@ from scenefuse.core.stage import quantity, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.geometry.icp import ScaleRange, triples_of_one_scale
 from scenefuse.register.agreement import draw_alignment
-from scenefuse.register.coarse import COARSE_POINTS, coarse_quantities
+from scenefuse.register.coarse import coarse_quantities
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.fine import ledger_row, pose_quantities
-from scenefuse.register.problem import Constraints, Estimate, Inputs, Problem, estimates, rms, scale_quantities
-from scenefuse.register.refinement import FINE_POINTS
+from scenefuse.register.problem import (
+    SURFACE_POINTS,
+    Constraints,
+    Estimate,
+    Inputs,
+    Problem,
+    estimates,
+    rms,
+    scale_quantities,
+)
 from scenefuse.register.score import SCORE_FRACTION, Hypothesis, score
 from scenefuse.register.uncertainty import uncertainty_quantities
 
@@ -93,9 +101,9 @@ def register_as_paper(
     held = 1.0 if scale == "none" else ledger[0].scale
     problem = Problem(obj, scene, ScaleRange(held, 0.0), Constraints(ups), seed)
     pose, notes = paper_coarse(problem)
-    coarse = _rated(problem, pose, SCORE_FRACTION / 2, COARSE_POINTS)
+    coarse = _rated(problem, pose, SCORE_FRACTION / 2, SURFACE_POINTS // 2)
     between = time.perf_counter()
-    fine = _rated(problem, paper_fine(obj, scene, pose), FineSettings().voxel_fraction, FINE_POINTS)
+    fine = _rated(problem, paper_fine(obj, scene, pose), FineSettings().voxel_fraction, SURFACE_POINTS)
     end = time.perf_counter()
     if picture is not None:
         draw_alignment(picture, obj, scene, fine.pose, seed)

@@ -15,14 +15,20 @@ from scenefuse.core.stage import quantity, threads, write_json
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.geometry.icp import MAX_TRIPLES, RANSAC_POSES, ScaleRange, refine_points, triples_of_one_scale
 from scenefuse.geometry.surface import Surface, prepare, with_grid, with_queries
-from scenefuse.register.problem import Constraints, Inputs, Problem, ScaleSettings, estimates, prior, scale_quantities
+from scenefuse.register.problem import (
+    SURFACE_POINTS,
+    Constraints,
+    Inputs,
+    Problem,
+    ScaleSettings,
+    estimates,
+    prior,
+    scale_quantities,
+)
 from scenefuse.register.score import RECALL_WEIGHT, SCORE_FRACTION, Hypothesis, best_distinct, score
 
 Candidate = tuple[Sim3, str]
 
-# Points kept of either cloud, and query points of the score: enough to rank poses, which differ grossly here.
-COARSE_POINTS = 6000
-QUERY_POINTS = 1200
 # Voxel of the upright sweep, as a share of the scene crop's diagonal: a fast Fourier transform of some 50^3 cells.
 SWEEP_VOXEL_FRACTION = 0.045
 BRIEF_ROUNDS = 12
@@ -104,12 +110,12 @@ def find_hypotheses(problem: Problem, settings: CoarseSettings) -> list[Hypothes
     """Distinct hypotheses, best first: features and gravity propose, brief refinement and the score rank them."""
     scales, diagonal, seed = problem.scales, problem.scene.diagonal, problem.seed
     tau = SCORE_FRACTION * diagonal
-    obj, target = problem.surfaces(scales.centre, SCORE_FRACTION / 2, COARSE_POINTS)
+    obj, target = problem.surfaces(scales.centre, SCORE_FRACTION / 2, SURFACE_POINTS // 2)
     # The grids of nearest points reach farther around the clouds than the first pairing distance.
     cell, reach = SCORE_FRACTION / 2 * diagonal, 5 * SCORE_FRACTION * diagonal
     both = (
-        with_queries(with_grid(obj, cell / scales.centre, reach / scales.centre), QUERY_POINTS, seed),
-        with_queries(with_grid(target, cell, reach), QUERY_POINTS, seed),
+        with_queries(with_grid(obj, cell / scales.centre, reach / scales.centre), SURFACE_POINTS // 10, seed),
+        with_queries(with_grid(target, cell, reach), SURFACE_POINTS // 10, seed),
     )
     upright = [(pose, "gravity") for pose in _upright(problem, settings)]
     by_features = [(pose, "features") for pose in _from_features(problem, settings)]
@@ -131,7 +137,7 @@ def _upright(problem: Problem, settings: CoarseSettings) -> list[Sim3]:
     if ups is None:
         return []
     level = Sim3(1.0, rotation_between(ups[1], UP), np.zeros(3))
-    obj, scene = problem.surfaces(scales.centre, SWEEP_VOXEL_FRACTION / 2, COARSE_POINTS)
+    obj, scene = problem.surfaces(scales.centre, SWEEP_VOXEL_FRACTION / 2, SURFACE_POINTS // 2)
     steps, most = (settings.scale_steps, settings.yaw_steps), settings.candidates // 2
     found = upright_candidates(obj, scene.transformed(level), ups[0], scales, *steps, voxel, most)
     return [level.inverse() @ pose for pose in found]
@@ -145,11 +151,11 @@ def _from_features(problem: Problem, settings: CoarseSettings) -> list[Sim3]:
     found: list[Sim3] = []
     for fraction in settings.voxel_fractions:
         voxel = fraction * problem.scene.diagonal
-        target = prepare(problem.scene, voxel, seed, COARSE_POINTS)
+        target = prepare(problem.scene, voxel, seed, SURFACE_POINTS // 2)
         target_features = fpfh(target, 5 * voxel)
         for step in steps:
             scale = scales.centre * np.exp(scales.width * step)
-            obj = prepare(problem.object, voxel / scale, seed, COARSE_POINTS)
+            obj = prepare(problem.object, voxel / scale, seed, SURFACE_POINTS // 2)
             pairs = match(fpfh(obj, 5 * voxel / scale), target_features)
             x, y = obj.points[pairs[:, 0]], target.points[pairs[:, 1]]
             found += ransac_similarities(
@@ -323,5 +329,5 @@ def _centred(problem: Problem) -> Hypothesis:
     rotation = np.eye(3) if ups is None else rotation_between(*ups)
     shift = problem.scene.points.mean(0) - scale * (rotation @ problem.object.points.mean(0))
     pose = Sim3(scale, rotation, shift)
-    surfaces = problem.surfaces(scale, SCORE_FRACTION / 2, COARSE_POINTS)
+    surfaces = problem.surfaces(scale, SCORE_FRACTION / 2, SURFACE_POINTS // 2)
     return Hypothesis(pose, "centres", score(*surfaces, pose, SCORE_FRACTION * problem.scene.diagonal, scale))

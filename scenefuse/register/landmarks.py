@@ -17,8 +17,7 @@ from scenefuse.core.transforms import Array
 from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.sfm.colmap import require_database
 
-# Points matched at once, and of each model at most: both bound memory.
-BLOCK_POINTS = 4096
+# Points of a model at most, those with the most observations.
 MAX_POINTS = 100_000
 # Views of a point whose descriptors are compared.
 DESCRIPTORS_PER_POINT = 3
@@ -150,7 +149,7 @@ def _untouched(database: Path) -> Iterator[Path]:
         yield Path(shutil.copyfile(database, Path(folder) / database.name))
 
 
-def match_landmarks(a: Landmarks, b: Landmarks, max_ratio: float) -> NDArray[np.int64]:
+def match_landmarks(a: Landmarks, b: Landmarks, max_ratio: float, block: int = 4096) -> NDArray[np.int64]:
     """Pairs (M, 2) of points that look most alike, mutually, and clearly more alike than any other two.
 
     Two points differ in look by the distance of their most similar descriptors. The ratio test is made from both
@@ -160,15 +159,16 @@ def match_landmarks(a: Landmarks, b: Landmarks, max_ratio: float) -> NDArray[np.
         a: points of one model.
         b: points of the other.
         max_ratio: largest distance to the partner over the distance to the next point (Lowe 2004).
+        block: points of either side that are compared at once.
     """
     best_a, best_b = np.full((len(a.points), 2), -1.0, np.float32), np.full((len(b.points), 2), -1.0, np.float32)
     partner_a, partner_b = np.zeros(len(a.points), np.int64), np.zeros(len(b.points), np.int64)
-    for i in range(0, len(a.points), BLOCK_POINTS):
-        ours = a.descriptors[i : i + BLOCK_POINTS]
-        for j in range(0, len(b.points), BLOCK_POINTS):
-            alike = _most_alike(ours, b.descriptors[j : j + BLOCK_POINTS])
-            _update(best_a[i : i + BLOCK_POINTS], partner_a[i : i + BLOCK_POINTS], alike, j)
-            _update(best_b[j : j + BLOCK_POINTS], partner_b[j : j + BLOCK_POINTS], alike.T, i)
+    for i in range(0, len(a.points), block):
+        ours = a.descriptors[i : i + block]
+        for j in range(0, len(b.points), block):
+            alike = _most_alike(ours, b.descriptors[j : j + block])
+            _update(best_a[i : i + block], partner_a[i : i + block], alike, j)
+            _update(best_b[j : j + block], partner_b[j : j + block], alike.T, i)
     mine = np.arange(len(a.points))
     mutual = (partner_b[partner_a] == mine) & (best_a[:, 0] > 0) if len(b.points) else np.zeros(len(mine), bool)
     pairs = np.stack([mine[mutual], partner_a[mutual]], axis=1)

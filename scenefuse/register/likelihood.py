@@ -24,8 +24,8 @@ NEIGHBOURS = 24
 START_NOISE = SCORE_FRACTION
 # It never gets below this share of the object's spacing: samples a spacing apart tell no more.
 MIN_NOISE = 0.75
-# Pieces to the scene's diagonal, and how many there must be: what errs together stays together.
-PIECES_ACROSS, MIN_PIECES = 6, 8
+# Pieces to the scene's diagonal: what errs together stays together.
+PIECES_ACROSS = 6
 # Copies of the scene that are drawn from the object, at a pose that is known.
 PLANTED_COPIES = 4
 # Fewer scene points on the object determine nothing.
@@ -249,12 +249,12 @@ def certified(
 def _covariance(scene: Surface, found: MostLikely, diagonal: float, hold_scale: bool) -> Array | None:
     """(7, 7) by the scatter of the gradients of the scene's pieces (sandwich estimator, Huber 1967, White 1982).
 
-    What errs together stays together: the pieces are cubes. None with too few of them.
+    What errs together stays together: the pieces are cubes. None where there are no more of them than parameters.
     """
     cells = np.floor(scene.points[scene.queries] / (diagonal / PIECES_ACROSS)).astype(np.int64)
     piece = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
     count = int(piece.max()) + 1
-    if count < MIN_PIECES:
+    if count <= found.gradients.shape[1]:
         return None
     sums = np.zeros((count, 7))
     np.add.at(sums, piece, found.gradients)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.icp import refine_planes, refine_points
 from scenefuse.geometry.surface import Surface, prepare, with_grid, with_queries
-from scenefuse.register.coarse import QUERY_POINTS, Candidate
+from scenefuse.register.coarse import Candidate
 from scenefuse.register.decision import (
     MAX_FREE_SPACE_VIOLATION,
     DecidedBy,
@@ -22,7 +22,7 @@ from scenefuse.register.decision import (
     unless_mirrored,
 )
 from scenefuse.register.likelihood import certified
-from scenefuse.register.problem import Problem
+from scenefuse.register.problem import SURFACE_POINTS, Problem
 from scenefuse.register.repetition import multiples, shifted, shifts_onto_itself, undecided_shift
 from scenefuse.register.score import (
     DISTINCT_ANGLE_DEG,
@@ -35,8 +35,6 @@ from scenefuse.register.score import (
 )
 from scenefuse.register.uncertainty import Uncertainty, common_error, with_bending
 
-# Points kept of either cloud; the polish queries a quarter of them.
-FINE_POINTS = 12000
 # First pairing distance, as a share of the diagonal: of poses that differ by less, one finds the other.
 START_FRACTION = DISTINCT_SHIFT
 # Hypotheses that are polished, and copies of the best that are.
@@ -104,7 +102,7 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
     polished = work.best_first([*polished, *(work.polish(h) for h in work.turned(polished[0]))])
     polished = work.best_first([*polished, *work.shifted(polished[0])])
     ranked, uncertainty, decided_by = work.compared_with_photos(polished)
-    shape = with_queries(work.obj, QUERY_POINTS, problem.seed)
+    shape = with_queries(work.obj, SURFACE_POINTS // 10, problem.seed)
     decision = decide(ranked, uncertainty, decided_by, shape, work.problem, settings, work.repetition(ranked[0].pose))
     if decision.registered and decided_by in ("geometry", "near"):
         decision = unless_mirrored(decision, ranked[0], work.mirror_image(ranked[0].pose), settings)
@@ -117,17 +115,17 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
 def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
     """Thin and index both clouds for poses of about this scale."""
     diagonal, fraction, seed = problem.scene.diagonal, settings.voxel_fraction, problem.seed
-    obj, scene = problem.surfaces(scale, fraction, FINE_POINTS)
+    obj, scene = problem.surfaces(scale, fraction, SURFACE_POINTS)
     cell, reach = 2 * fraction * diagonal, 2 * START_FRACTION * diagonal
     return _Work(
         replace(problem, scales=problem.scales.widened(PRIOR_SLACK_LOG)),
         settings,
         obj,
         (
-            with_queries(with_grid(obj, cell / scale, reach / scale), QUERY_POINTS, seed),
-            with_queries(with_grid(scene, cell, reach), QUERY_POINTS, seed),
+            with_queries(with_grid(obj, cell / scale, reach / scale), SURFACE_POINTS // 10, seed),
+            with_queries(with_grid(scene, cell, reach), SURFACE_POINTS // 10, seed),
         ),
-        (with_queries(obj, FINE_POINTS // 4, seed), with_queries(scene, FINE_POINTS // 4, seed)),
+        (with_queries(obj, SURFACE_POINTS // 4, seed), with_queries(scene, SURFACE_POINTS // 4, seed)),
         _shifts(problem, obj, fraction * diagonal / scale),
     )
 
@@ -138,8 +136,8 @@ def _shifts(problem: Problem, obj: Surface, spacing: float) -> list[Array]:
     # Fine enough at any scale: a quarter of the distance within which points agree, on the object's own diagonal.
     own = SCORE_FRACTION / 4 * problem.object.diagonal
     if own < spacing:
-        obj, spacing = prepare(problem.object, own, problem.seed, FINE_POINTS), own
-    return shifts_onto_itself(with_queries(obj, QUERY_POINTS, problem.seed), spacing)
+        obj, spacing = prepare(problem.object, own, problem.seed, SURFACE_POINTS), own
+    return shifts_onto_itself(with_queries(obj, SURFACE_POINTS // 10, problem.seed), spacing)
 
 
 @dataclass(frozen=True)

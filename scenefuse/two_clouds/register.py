@@ -38,9 +38,8 @@ from scenefuse.two_clouds.complete import complete, fusion_settings, write_files
 from scenefuse.two_clouds.page import VIEW_REACH, write_page
 
 NOTHING = Known()
-# An object may be so many times as large as the part of the scene that shows it, and has to be at least so many times
-# as large as the scene's points are apart.
-MAX_SIZE_RATIO, MIN_SPACINGS = 10.0, 10.0
+# How many times as large as the scene's part that shows it an object may be, and as that part's spacing it has to be.
+MAX_SIZE_RATIO = 10.0
 # Points of the part of a scene in which an object is searched: of many more, some are left out.
 MAX_SEARCHED_POINTS = 1 << 22
 OUTPUTS = (
@@ -262,7 +261,7 @@ def _check_size(scales: ScaleRange, given: Given) -> None:
     points."""
     most, part, step = scales.centre * float(np.exp(scales.width)), given.scene.part.diagonal, given.scene.spacing
     across = most * given.object.diagonal
-    if across > MAX_SIZE_RATIO * part or across < MIN_SPACINGS * step:
+    if across > MAX_SIZE_RATIO * part or across < MAX_SIZE_RATIO * step:
         raise StageError(
             f"at a scale of {most:.4g} the object would be {across:.4g} across, and the searched part of the scene is"
             f" {part:.4g}, its points {step:.4g} apart; correct --scale or --scale-range: scene units per object unit"

@@ -147,8 +147,12 @@ def run(
             if (name, trial) in known:
                 continue
             start = time.process_time()
-            with nullcontext() if rule is None else without(rule):
-                measured = module.evaluate(trial, rule)
+            try:
+                with nullcontext() if rule is None else without(rule):
+                    measured = module.evaluate(trial, rule)
+            except ValueError as error:
+                print(f"{name}: {error}", flush=True)
+                continue
             row = {"rule": name, "trial": trial, **measured, "cpu_s": time.process_time() - start}
             pd.DataFrame([row]).to_csv(out, sep="\t", index=False, mode="a", header=not out.is_file())
             print("\t".join(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()), flush=True)

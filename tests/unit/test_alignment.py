@@ -326,11 +326,10 @@ def test_a_cap_keeps_the_points_seen_most(pair):
     assert len(few.rays) == few.start[-1]
 
 
-def test_matching_does_not_depend_on_the_size_of_blocks(pair, monkeypatch):
+def test_matching_does_not_depend_on_the_size_of_blocks(pair):
     obj, scene = (read_landmarks(model, database) for model, database in pair)
     whole = match_landmarks(obj, scene, 0.85)
-    monkeypatch.setattr("scenefuse.register.landmarks.BLOCK_POINTS", 37)
-    np.testing.assert_array_equal(match_landmarks(obj, scene, 0.85), whole)
+    np.testing.assert_array_equal(match_landmarks(obj, scene, 0.85, block=37), whole)
 
 
 def test_a_database_of_other_photos_is_refused(pair, tmp_path):

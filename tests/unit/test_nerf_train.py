@@ -14,7 +14,8 @@ from scenefuse.core import checkpoints
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3
-from scenefuse.geometry.consistency import MAX_VIEWS, back_project, compare, normals_from_depth, others, surface_points
+from scenefuse.geometry.consistency import back_project, compare, normals_from_depth, others, surface_points
+from scenefuse.geometry.photo_check import MAX_PHOTOS
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.rays import dilate, draw_batch, pixel_pool
@@ -243,7 +244,7 @@ def test_of_many_views_the_near_ones_and_fewer_far_ones_are_compared():
 
     assert others(7, ring(40)).tolist() == [k for k in range(40) if k != 7]
     compared = others(7, ring(400))
-    assert len(compared) == len(set(compared)) == MAX_VIEWS
+    assert len(compared) == len(set(compared)) == MAX_PHOTOS
     away = np.abs((compared - 7 + 200) % 400 - 200)
     assert away.min() == 1 and away.max() == 200
     assert (away <= 10).sum() > (away >= 180).sum() > 0
