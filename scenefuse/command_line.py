@@ -12,7 +12,7 @@ from pathlib import Path
 from scenefuse.core.version import VERSION
 
 ALL = "pip install 'scenefuse[all]'"
-OWN_SETTINGS, SCENES = Path("config/config.yaml"), Path("config/scenes.tsv")
+SCENES = Path("config/scenes.tsv")
 REPORT = Path("results/summary/report.html")
 # Snakemake's options that say how much runs at a time, or that another machine decides it.
 PARALLEL = ("--cores", "-c", "--jobs", "-j", "--profile", "--workflow-profile", "--executor", "-e")
@@ -84,6 +84,8 @@ def _need_project(*elsewhere: str) -> None:
 
 def _settings_files() -> tuple[list[Path], list[str]]:
     """The settings files of the command line, or the project's; and the words that name the latter to Snakemake."""
+    from scenefuse.core.settings import OWN_SETTINGS
+
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--configfile", "--configfiles", nargs="+", type=Path, default=[])
     given = parser.parse_known_args(sys.argv[1:])[0].configfile
@@ -120,10 +122,14 @@ def _export() -> None:
     name, scene = ("{" + ",".join(found) + "}" if len(found) > 1 else found[0] for found in (names, scenes))
     print("Export:", ", ".join(EXPORTS[item].format(object=name, scene=scene) for item in what), flush=True)
     if REPORT.is_file():
-        # The page shows what was exported.
-        ended = subprocess.run(
-            [*run, str(REPORT), *others, "--quiet", "all", "--allowed-rules", "write_report"]
-        ).returncode
+        from scenefuse.report.facts import closing_lines
+
+        # The page shows what was exported. A run that makes it says where it is.
+        shown = REPORT.stat().st_mtime
+        page = [*run, str(REPORT), *others, "--quiet", "all", "--allowed-rules", "write_report"]
+        ended = subprocess.run(page).returncode
+        if not ended and REPORT.stat().st_mtime == shown:
+            print(closing_lines(REPORT.parent), flush=True)
     sys.exit(ended)
 
 

@@ -16,15 +16,14 @@ from typing import Annotated, Literal
 import tyro
 
 from scenefuse.core.machine import has_screen
-from scenefuse.core.settings import PACKAGE, ROOT, read_differences
+from scenefuse.core.settings import OWN_SETTINGS, PACKAGE, ROOT, read_differences
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_cells, read_table
 from scenefuse.new_project import OBJECTS, SCENES, cell_of, default_name, fill, make_project, project_rows
 from scenefuse.report.facts import closing_lines
 from scenefuse.report.forecast import FORECAST, duration, read_forecast, seconds_left
 
-OWN_SETTINGS, LOG = Path("config/config.yaml"), Path("results/logs/run.log")
-SUMMARY = Path("results/summary")
+LOG, SUMMARY = Path("results/logs/run.log"), Path("results/summary")
 # Lines of a run that people want to see, or that say why it failed.
 JOB, FORECAST_LINE = re.compile(r"Job \d+: (.+)"), re.compile("(time|memory|disk): .+")
 ERROR, FAILED, CLOSING = re.compile(r"\w*(Error|Exception)\b.*:"), ("failed: ", "error: "), "Result: "
@@ -42,7 +41,7 @@ def complete(
     masks: tuple[Path, ...] = (),
     preset: Preset = "normal",
     cores: int | None = None,
-    no_browser: tyro.conf.UseCounterAction[int] = 0,
+    no_browser: Annotated[tyro.conf.UseCounterAction[int], tyro.conf.arg(help_behavior_hint="")] = 0,
 ) -> None:
     """Complete objects in a drone reconstruction: makes a project, opens the page to click on each object, runs the
     workflow, and opens the report. The same command again goes on where it was left.

@@ -10,7 +10,7 @@ from typing import Literal
 import tyro
 
 from scenefuse.cloud.formats import READERS
-from scenefuse.core.settings import PACKAGE, ROOT, schema_of
+from scenefuse.core.settings import OWN_SETTINGS, PACKAGE, ROOT, schema_of
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.tables import Row, read_table
 from scenefuse.photos.photo_files import VIDEO_SUFFIXES, in_folders, photo_files
@@ -62,7 +62,7 @@ def make_project(folder: Path, scene: Path | None, objects: Sequence[Path], pres
     text = (PACKAGE / "assets/project.md").read_text().format(name=folder.resolve().name, object=names[0])
     texts = {
         **{path.as_posix(): _table(COLUMNS[path], rows[path]) for path in rows},
-        "config/config.yaml": SETTINGS.format(root=ROOT) + (ROOT / f"config/presets/{preset}.yaml").read_text(),
+        OWN_SETTINGS.as_posix(): SETTINGS.format(root=ROOT) + (ROOT / f"config/presets/{preset}.yaml").read_text(),
         "README.md": text + _columns("scenes") + _columns("objects"),
     }
     for path in (folder / name for name in texts):

@@ -16,6 +16,8 @@ PACKAGE = Path(__file__).resolve().parent.parent
 SHIPPED = PACKAGE / "shipped"
 # Folder with workflow/, scripts/ and config/: inside the package where it was installed, else the clone's.
 ROOT = SHIPPED if SHIPPED.is_dir() else PACKAGE.parent
+# A project's own settings.
+OWN_SETTINGS = Path("config/config.yaml")
 # More values than any settings file has; messages about fewer are still short.
 MAX_VALUES = 10_000
 T = TypeVar("T")

@@ -7,7 +7,7 @@ import threading
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import parse_qs, urlsplit
 
 import nicegui
@@ -37,7 +37,7 @@ def pick(
     object: str | None = None,
     configfile: tuple[Path, ...] = (),
     port: int = 0,
-    no_browser: tyro.conf.UseCounterAction[int] = 0,
+    no_browser: Annotated[tyro.conf.UseCounterAction[int], tyro.conf.arg(help_behavior_hint="")] = 0,
 ) -> None:
     """Click what an object is in its photos, and points in its scene's, in a page of this machine's browser.
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.project import read_project
-from scenefuse.core.settings import read_settings
+from scenefuse.core.settings import OWN_SETTINGS, read_settings
 from scenefuse.core.stage import StageError, read_json
 from scenefuse.core.transforms import Array
 from scenefuse.photos.pictures import read_mask
@@ -24,7 +24,6 @@ from scenefuse.pick.segmenter import Segmenter
 from scenefuse.pick.tables import tables_of
 
 Mask = NDArray[np.bool_]
-OWN_SETTINGS = Path("config/config.yaml")
 
 
 class Session:

@@ -5,7 +5,7 @@ import time
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -81,7 +81,7 @@ def register(
     scene: Path,
     out: Path = Path("registered"),
     format: Literal["ply", "laz", "las"] = "ply",
-    fuse: tyro.conf.UseCounterAction[int] = 0,
+    fuse: Annotated[tyro.conf.UseCounterAction[int], tyro.conf.arg(help_behavior_hint="")] = 0,
     known: Known = NOTHING,
     config: Path | None = None,
     seed: int | None = None,

@@ -1,6 +1,7 @@
 """Surfaces of completed clouds: classes of faces, gaps, and the files that hold them."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -18,6 +19,7 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.core.transforms import Sim3, look_at
 from scenefuse.fuse.measure import Evidence
 from scenefuse.photos.workspace import View, read_views, write_model
+from scenefuse.report import facts
 from scenefuse.report.facts import surface_facts
 from scenefuse.surface.cameras import export_cameras
 from scenefuse.surface.drawings import NOTHING, SIDES, Tag, draw, draw_surface, wall_turn
@@ -301,18 +303,25 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
     for name in ("objects/shed/fused.ply", "objects/barn/fused.ply", "scenes/yard/dense.ply", "summary/report.html"):
         (tmp_path / "results" / name).parent.mkdir(parents=True)
         (tmp_path / "results" / name).touch()
-    runs = []
-    monkeypatch.setattr(
-        subprocess, "run", lambda words, **_: runs.append(words) or subprocess.CompletedProcess(words, 0)
-    )
-    monkeypatch.setattr(sys, "argv", ["scenefuse", "export", "--object", "shed", "--cores", "2"])
+    runs, done = [], subprocess.CompletedProcess([], 0)
+    monkeypatch.setattr(subprocess, "run", lambda words, **_: runs.append(words) or done)
+    monkeypatch.setattr(facts, "closing_lines", lambda summary: f"Result: 1; {summary}")
+    words = ["scenefuse", "export", "--object", "shed", "--cores", "2"]
+    monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit) as ended:
         command_line.main()
     # No side has photos, so there are no cameras.
     assert ended.value.code == 0 and not any("cameras" in word for word in runs[0][:6])
     assert {"results/objects/shed/surface.glb", "results/objects/shed/drawings", "2"} <= set(runs[0])
     assert "results/summary/report.html" in runs[1]
-    assert capsys.readouterr().out == "Export: results/objects/shed/surface.glb, results/objects/shed/drawings\n"
+    # Nothing was left to do: a run that makes the page prints the closing lines itself.
+    exported = "Export: results/objects/shed/surface.glb, results/objects/shed/drawings\n"
+    assert capsys.readouterr().out == f"{exported}Result: 1; results/summary\n"
+    monkeypatch.setattr(subprocess, "run", lambda words, **_: os.utime("results/summary/report.html", (1, 1)) or done)
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit):
+        command_line.main()
+    assert capsys.readouterr().out == exported
 
 
 def test_the_report_says_of_a_surface_how_much_is_measured(closed, tmp_path: Path):
