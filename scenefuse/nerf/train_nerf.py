@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from scenefuse.core.settings import build, read_settings
@@ -19,7 +20,7 @@ from scenefuse.nerf.rendered_maps import RenderedMapSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe
 from scenefuse.photos.pictures import read_depth, read_gray, read_normals, read_rgb
-from scenefuse.photos.sheets import Image, Sheet, depth_colors, draw_sheet, save_png
+from scenefuse.photos.sheets import TILE_PX, Image, depth_colors, draw_sheet, save_png
 from scenefuse.sfm.import_photos import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
 
@@ -152,18 +153,17 @@ def _print_summary(report: dict[str, Any], out: Path, refused: str | None) -> No
     print(f"written    {', '.join(map(str, written))}", flush=True)
 
 
-def render_sheet(workspace: Path, masks: Path, stage: Path) -> Image:
+def render_sheet(workspace: Path, masks: Path, stage: Path) -> Figure:
     """A row for each of at most six rendered photos: the photo inside its mask, the render, its depth, its normals."""
     photos = {path.stem: path for path in sorted((workspace / "images").iterdir())}
     stems = sorted(path.stem for path in (stage / "renders").glob("*.png"))
     shown = [stems[i] for i in np.unique(np.linspace(0, len(stems) - 1, 6).round().astype(int))]
-    rows = [_sheet_row(photos[stem], masks, stage) for stem in shown]
     note = f"{len(shown)} of {len(stems)} rendered photos; depth near bright, far dark; normals in the camera's axes"
     labels = ["photo in its mask", "render", "depth", "normals"]
-    height, width = rows[0][0].shape[:2]
-    cells: list[list[Image | None]] = [[*row] for row in rows]
-    tile = (320, round(320 * height / width))
-    return draw_sheet(Sheet("Renders beside the photos", note, cells, shown, labels, {}, tile))
+    rows = [list(zip(labels, _sheet_row(photos[stem], masks, stage))) for stem in shown]
+    height, width = rows[0][0][1].shape[:2]
+    tile = (TILE_PX[0], round(TILE_PX[0] * height / width))
+    return draw_sheet("Renders beside the photos", note, rows, tile, shown)
 
 
 def _sheet_row(photo: Path, masks: Path, stage: Path) -> list[Image]:

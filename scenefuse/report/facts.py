@@ -8,41 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.report.run_summary import ALONE
-from scenefuse.report.values import length, percent, read_table
+from scenefuse.report.values import asset, length, percent, read_table
 
 Row = Mapping[str, Any]
 # Photos of a scene whose ground pixels and dates are looked at, spread evenly.
 LOOKED_AT = 20
 # Errors that 90 % of the points do not exceed, over the root mean square of normal errors in a plane, and upwards.
 CE90_OVER_RMS, LE90_OVER_RMS = float(np.sqrt(np.log(10))), 1.6449
-RESULTS = {
-    "registered": "Found in the scene and completed",
-    "ungated": "Added to the scene, but nothing checked its place",
-    "unregistered": "Not added to the scene",
-    ALONE: "Reconstructed by itself; it lies in no scene",
-    "failed": "Not finished",
-    "missing": "Not run yet",
-}
 DONE = ("registered", "ungated", ALONE)
-DECIDED_BY = {
-    "geometry": "its place follows from the clouds alone, for no photos link object and scene",
-    "near": "its place follows from the clouds, near where the photos put it",
-    "both": "the photos and the clouds put it at the same place",
-    "photos": "its place follows from the photos, against the clouds",
-}
-
-
-MISSING = {
-    "never_seen": "seen by no photo",
-    "untextured": "too plain to measure",
-    "contradicted": "where photos disagree",
-}
+# Words for statuses and what they rest on.
+WORDS: dict[str, dict[str, str]] = yaml.safe_load(asset("report.yaml"))["words"]
 
 
 def object_facts(row: Row) -> dict[str, str]:
@@ -51,8 +33,8 @@ def object_facts(row: Row) -> dict[str, str]:
     unit, status = has.get("unit", "scene units"), has["status"]
     why = has.get("reason") if status == "unregistered" else has.get("error")
     if status in DONE:
-        why = DECIDED_BY.get(has.get("decided_by", ""))
-    facts["Result"] = RESULTS[status] + (f": {why}" if why else "")
+        why = WORDS["decided_by"].get(has.get("decided_by", ""))
+    facts["Result"] = WORDS["results"][status] + (f": {why}" if why else "")
     if status == ALONE:
         facts["File"] = f"objects/{has['object']}/object.ply"
     if status == "unregistered":
@@ -62,7 +44,9 @@ def object_facts(row: Row) -> dict[str, str]:
         facts["Size"] = f"{sides}, {length(has['height'], unit)} high"
     if "surface_missing" in has:
         share = has["surface_missing"]
-        kinds = [f"{percent(has[f'surface_{n}'])} {what}" for n, what in MISSING.items() if has.get(f"surface_{n}")]
+        kinds = [
+            f"{percent(has[f'surface_{n}'])} {what}" for n, what in WORDS["missing"].items() if has.get(f"surface_{n}")
+        ]
         facts["Surface"] = f"{percent(1 - share)} is there" + (
             f", {percent(share)} is missing: {', '.join(kinds)}" if kinds else ""
         )

@@ -1,35 +1,35 @@
 """The figures of an object: what was missing, what was added, how it fits (paper Figures 2, 3, 5)."""
 
-import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import StageError, atomic_directory, read_json, value
-from scenefuse.core.transforms import Array, Sim3, box_around, rotation_between
+from scenefuse.core.transforms import UP, Array, Sim3, box_around, rotation_between
 from scenefuse.fuse.fuse_object import is_placed
 from scenefuse.fuse.missing import Lack
 from scenefuse.fuse.write import after_fusion
-from scenefuse.photos.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
-from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, inner, object_sheet, sides, upright
+from scenefuse.photos.pictures import read_depth, read_mask, read_rgb
+from scenefuse.photos.sheets import TILE_PX, Cell, Image, depth_colors, draw_sheet, save_png
+from scenefuse.photos.workspace import read_views
 from scenefuse.report.render import luminance, orbit_camera, point_radii, render
 from scenefuse.report.values import load, unit_of
-from scenefuse.report.view import REMOVED, VIEW_POINTS, View, merge, thin, within, write_view
+from scenefuse.report.view import REACH, view_of, within, write_view
+from scenefuse.sfm.gravity import estimate_up
 
-COLORS = {
-    "scene": (205, 208, 212),
-    "crop": (40, 95, 185),
-    "object": (245, 170, 85),
-    Lack.NEVER_SEEN: (214, 38, 31),
-    Lack.UNTEXTURED: (52, 101, 196),
-    Lack.CONTRADICTED: (150, 60, 170),
-}
-# How far around the object, as shares of its diagonal: sideways enough to see what it stands on.
-REACH = (0.35, 0.35, 0.15)
+SCENE, CROP, OBJECT = "#cdd0d4", "#285fb9", "#f5aa55"
+LACKS = {Lack.NEVER_SEEN: "#d6261f", Lack.UNTEXTURED: "#3465c4", Lack.CONTRADICTED: "#963caa"}
+# Azimuths of the four sides that a row of pictures shows.
+SIDES_DEG = (30.0, 120.0, 210.0, 300.0)
 # Clouds and the radii of their points' discs.
 Discs = list[tuple[Cloud, NDArray[np.float32]]]
 
@@ -118,26 +118,25 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
         (cloud, point_radii(cloud.points, source=cloud.fields.get("source"))) for cloud in (join.before, join.after)
     ]
     azimuth_deg = _most_changed(clouds, join.framed)
-    pictures = {
-        "before_after": _before_after(inputs.name, join, clouds),
-        "registration": _registration(inputs.name, join),
-        **dict(zip(("before", "after"), _large(clouds, join.framed, azimuth_deg))),
-    }
+    large = _large(clouds, join.framed, azimuth_deg, (2 * TILE_PX[0], 2 * TILE_PX[1]))
+    pictures: dict[str, Image | Figure] = dict(zip(("before", "after"), large))
+    pictures["before_after"] = _before_after(inputs.name, join, clouds)
+    pictures["registration"] = _registration(inputs.name, join)
     if join.fused and join.missing is not None:
         pictures["missing"] = _missing(inputs.name, join, join.missing, clouds[1][1])
     cloud = join.object_cloud or read_cloud(inputs.object_cloud)
     if inputs.workspace is not None:
         cloud = join.object_cloud or upright(cloud, inputs.workspace)
-    if inputs.workspace is None or inputs.masks is None or not inputs.stages:
-        pictures["object"] = cloud_sheet(inputs.name, cloud, inputs.workspace is not None)
-    else:
-        pictures["object"] = object_sheet(inputs.name, cloud, inputs.workspace, inputs.masks, list(inputs.stages))
+    pictures["object"] = _object_sheet(inputs.name, cloud, inputs.workspace, inputs.masks, inputs.stages)
     with atomic_directory(figures) as folder:
         for name, picture in pictures.items():
             save_png(folder / f"{name}.png", picture)
             print(f"{name}.png", flush=True)
         if join.fused:
-            write_view(folder, _view(inputs.name, join, azimuth_deg))
+            numbers = np.unique(join.after.fields.get("source", np.zeros(1, np.int64))).tolist()
+            sources = {number: f"added from {inputs.name}" if number else "scene" for number in numbers}
+            box = join.framed.min(0), join.framed.max(0)
+            write_view(folder, view_of(join.before, join.after, *box, sources, join.unit, azimuth_deg))
 
 
 def draw_lone_object(
@@ -162,129 +161,182 @@ def draw_lone_object(
         figures: output folder.
     """
     cloud = upright(read_cloud(object_cloud), workspace)
-    sheet = object_sheet(name, cloud, workspace, masks, list(stages))
-    framed = inner(cloud.points)
-    low, high = framed.min(0), framed.max(0)
-    points = thin(merge(cloud, cloud), VIEW_POINTS)
+    sheet, framed = _object_sheet(name, cloud, workspace, masks, stages), inner(cloud.points)
     unit = read_json(sparse_json).get("length_unit", {}).get("value", "object units")
-    view = View(points, {0: name}, unit, low, high, SIDES_DEG[0], 18.0, len(cloud), len(cloud))
     with atomic_directory(figures) as folder:
         save_png(folder / "object.png", sheet)
-        write_view(folder, view)
+        box = framed.min(0), framed.max(0)
+        write_view(folder, view_of(cloud, cloud, *box, {0: name}, unit, SIDES_DEG[0]))
 
 
-def _view(name: str, join: Surroundings, azimuth_deg: float) -> View:
-    """The 3D view of an object: its surroundings before and after, thinned."""
-    points, low, high = merge(join.before, join.after), join.framed.min(0), join.framed.max(0)
-    points.fields["near"][:] = within(points.points, low, high)
-    thinned = thin(points, VIEW_POINTS)
-    found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
-    sources = {0: "scene"} | {number: f"added from {name}" for number in found}
-    counts = len(join.before), len(join.after)
-    return View(thinned, sources, join.unit, low, high, azimuth_deg, 18.0, *counts)
-
-
-def _before_after(name: str, join: Surroundings, clouds: Discs) -> Image:
+def _before_after(name: str, join: Surroundings, clouds: Discs) -> Figure:
     """Rows before and after; four sides from slightly above, and from below with the surroundings cut away."""
-    tile = (350, 290)
     low, high = join.framed.min(0), join.framed.max(0)
-    margin = 0.06 * float(np.linalg.norm(high - low)) * np.array([1.0, 1.0, 0.0])
-    rows: list[list[Image | None]] = []
+    rows = []
     for cloud, radii in clouds:
-        near = ((cloud.points >= low - margin) & (cloud.points <= high + margin))[:, :2].all(1)
-        from_below = orbit_camera(join.framed, SIDES_DEG[0], -14.0, tile)
-        rows.append([*sides(cloud, join.framed, radii, tile, 22.0), render(cloud[near], from_below, radii[near])])
-    after = "after" if join.fused else "after (not fused)"
-    columns = [f"azimuth {a:.0f}°" for a in SIDES_DEG] + ["from below, surroundings cut away"]
-    return draw_sheet(Sheet(f"{name}: before and after", join.decision, rows, ["before", after], columns, {}, tile))
+        near = within(cloud.points[:, :2], low[:2], high[:2])
+        from_below = render(cloud[near], orbit_camera(join.framed, SIDES_DEG[0], -14.0, TILE_PX), radii[near])
+        rows.append([*_sides(cloud, join.framed, radii), ("from below, surroundings cut away", from_below)])
+    labels = ["before", "after" if join.fused else "after (not fused)"]
+    return draw_sheet(f"{name}: before and after", join.decision, rows, labels=labels)
 
 
-def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.float32]) -> Image:
+def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.float32]) -> Figure:
     """What is still missing, coloured by why, from above with the stations, and from the best of these."""
-    tile = (430, 350)
     kinds = cells.fields["missing"] if len(cells) else np.zeros(0, np.uint8)
-    shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
-    colors = np.concatenate(
-        [COLORS["scene"] * shade, np.array([COLORS[kind] for kind in kinds.tolist()]).reshape(-1, 3)]
-    )
+    colors = join.after.colors
+    brightness = np.ones(len(join.after)) if colors is None else luminance(colors) / 255
+    shade = _rgb(SCENE) * (0.6 + 0.4 * brightness[:, None])
+    colors = np.concatenate([shade, np.array([_rgb(LACKS[kind]) for kind in kinds.tolist()]).reshape(-1, 3)])
     side = 1.2 * float(np.median(radii)) if len(cells) < 2 else 0.8 * spacing(cells.points)
     cloud, sizes = Cloud(np.concatenate([join.after.points, cells.points])), np.append(radii, np.full(len(cells), side))
-    middle = (join.framed.min(0) + join.framed.max(0)) / 2
-    toward = join.stations[: len(SIDES_DEG) - 1] - middle
-    turns = np.degrees(np.arctan2(toward[:, 1], toward[:, 0])).tolist()
-    heights = np.degrees(np.arctan2(toward[:, 2], np.linalg.norm(toward[:, :2], axis=1))).tolist()
-    away = np.linalg.norm(toward, axis=1)
-    titles = [f"from station {k}, {distance:.3g} {join.unit} away" for k, distance in enumerate(away, 1)]
-    for azimuth in SIDES_DEG[len(turns) + 1 :]:
-        turns, heights, titles = [*turns, azimuth], [*heights, 22.0], [*titles, f"azimuth {azimuth:.0f}°"]
-    images: list[Image | None] = [_plan_view(join, cloud, sizes, colors.astype(np.uint8), tile)]
-    for turn, height in zip(turns, heights):
-        images.append(render(cloud, orbit_camera(join.framed, turn, height, tile), sizes, colors.astype(np.uint8)))
+    from_above = orbit_camera(np.concatenate([join.framed, join.stations]), -90.0, 90.0, TILE_PX, orthographic=True)
+    cameras = {"from above, with the stations": from_above}
+    toward = join.stations[: len(SIDES_DEG) - 1] - (join.framed.min(0) + join.framed.max(0)) / 2
+    for number, (x, y, z) in enumerate(toward, 1):
+        turn, height = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]).tolist()
+        label = f"from station {number}, {np.linalg.norm([x, y, z]):.3g} {join.unit} away"
+        cameras[label] = orbit_camera(join.framed, turn, height, TILE_PX)
+    for azimuth in SIDES_DEG[len(cameras) :]:
+        cameras[f"azimuth {azimuth:.0f}°"] = orbit_camera(join.framed, azimuth, 20.0, TILE_PX)
+    pictures = [(label, render(cloud, camera, sizes, colors)) for label, camera in cameras.items()]
     counts = ", ".join(f"{kind.name.lower().replace('_', ' ')} {(kinds == kind).sum()}" for kind in Lack)
-    shown = f", the best {len(away)} shown" if len(away) < len(join.stations) else ""
+    shown = f", the best {len(toward)} shown" if len(toward) < len(join.stations) else ""
     note = f"missing cells: {counts} (red, blue, purple); stations: {len(join.stations)}{shown}; see next_photos.csv"
-    columns = ["from above, with the stations", *titles]
-    return draw_sheet(Sheet(f"{name}: what is still missing", note, [images], [], columns, {}, tile))
+    sheet = draw_sheet(f"{name}: what is still missing", note, [pictures])
+    axes, middle = sheet.axes[0], from_above.project(join.framed.mean(0, keepdims=True))[0][0]
+    for number, place in enumerate(from_above.project(join.stations)[0], 1):
+        arrow = {"arrowstyle": "->", "color": "0.5", "shrinkB": 40}
+        mark = {"boxstyle": "circle", "color": LACKS[Lack.NEVER_SEEN]}
+        axes.annotate(
+            str(number), middle, place, arrowprops=arrow, bbox=mark, color="white", ha="center", va="center"
+        )  # fmt: skip
+    return sheet
 
 
-def _plan_view(join: Surroundings, cloud: Cloud, radii: Array, colors: Image, tile: tuple[int, int]) -> Image:
-    """The object from above, and the numbered stations around it."""
-    camera = orbit_camera(
-        np.concatenate([join.framed, join.stations]), -90.0, 90.0, tile, orthographic=True, margin=0.1
-    )
-    sheet = new_figure(tile)
-    axes = add_axes(sheet, (0, 0, *tile), tile)
-    axes.imshow(render(cloud, camera, radii, colors))
-    axes.set(xlim=(0, tile[0]), ylim=(tile[1], 0))
-    middle = camera.project(join.framed.mean(0, keepdims=True))[0][0]
-    for station, (x, y) in enumerate(camera.project(join.stations)[0], 1):
-        axes.annotate("", middle, (x, y), arrowprops={"arrowstyle": "->", "color": "#888888", "shrinkB": 40})
-        axes.scatter([x], [y], s=150, c="#d6261f", edgecolors="white", zorder=3)
-        axes.text(x, y, str(station), ha="center", va="center", fontsize=9, color="white", zorder=4)
-    return to_image(sheet)
-
-
-def _registration(name: str, join: Surroundings) -> Image:
+def _registration(name: str, join: Surroundings) -> Figure:
     """The object over the crop from three sides."""
-    tile, dots = (480, 390), point_radii(join.crop.points)
+    dots = point_radii(join.crop.points)
     radii = 0.5 * np.minimum(dots, np.float32(np.median(dots)))
-    colors, framed = np.tile(np.array(COLORS["crop"], np.uint8), (len(join.crop), 1)), join.crop.points
+    colors, framed = np.tile(_rgb(CROP), (len(join.crop), 1)), join.crop.points
     if join.object_cloud is not None:
         framed = np.concatenate([framed, join.object_cloud.points])
         radii = np.concatenate([radii, point_radii(join.object_cloud.points)])
-        colors = np.concatenate([colors, np.tile(np.array(COLORS["object"], np.uint8), (len(join.object_cloud), 1))])
+        colors = np.concatenate([colors, np.tile(_rgb(OBJECT), (len(join.object_cloud), 1))])
     # Small dots of the crop over the closed surface of the object; without normals both are shaded by depth alone.
     cloud = Cloud(framed)
     views = {"side, azimuth 30°": (30.0, 12.0), "side, azimuth 120°": (120.0, 12.0), "from above": (-90.0, 90.0)}
-    images: list[Image | None] = [
-        render(cloud, orbit_camera(framed, a, e, tile, orthographic=True), radii, colors) for a, e in views.values()
+    cells = [
+        (label, render(cloud, orbit_camera(framed, *angles, TILE_PX, orthographic=True), radii, colors))
+        for label, angles in views.items()
     ]
-    note = f"{join.decision}. Blue: crop of the scene, orange: object" + (
-        "" if join.object_cloud is not None else " (no pose)"
-    )
-    return draw_sheet(Sheet(f"{name}: registration", note, [images], [], list(views), {}, tile))
+    no_pose = " (no pose)" if join.object_cloud is None else ""
+    note = f"{join.decision}. Blue: crop of the scene, orange: object{no_pose}"
+    return draw_sheet(f"{name}: registration", note, [cells])
 
 
-def _large(
-    clouds: Discs, framed: Array, azimuth_deg: float, size_px: tuple[int, int] = (840, 600)
-) -> tuple[Image, Image]:
+def _large(clouds: Discs, framed: Array, azimuth_deg: float, size_px: tuple[int, int]) -> list[Image]:
     """The same view before and after."""
-    camera = orbit_camera(framed, azimuth_deg, 15.0, size_px, margin=0.1)
-    first, second = (render(cloud, camera, radii) for cloud, radii in clouds)
-    return first, second
+    camera = orbit_camera(framed, azimuth_deg, 15.0, size_px)
+    return [render(cloud, camera, radii) for cloud, radii in clouds]
 
 
 def _most_changed(clouds: Discs, framed: Array) -> float:
     """The azimuth, in degrees, from which before and after differ most."""
-    azimuths = np.arange(0.0, 360.0, 45.0)
-    pairs = (_large(clouds, framed, float(azimuth), (120, 90)) for azimuth in azimuths)
-    changes = [float(np.abs(np.subtract(first, second, dtype=np.float32)).mean()) for first, second in pairs]
+    azimuths = np.arange(0.0, 360.0, 45.0).tolist()
+    pairs = (_large(clouds, framed, azimuth, (120, 90)) for azimuth in azimuths)
+    changes = [float(np.abs(np.subtract(*pair, dtype=np.float32)).mean()) for pair in pairs]
     return float(azimuths[int(np.argmax(changes))])
 
 
-def _brightness(cloud: Cloud) -> Array:
-    """(N,) brightness 0 to 1 of the points' colours; 1 where there are none."""
-    return np.ones(len(cloud)) if cloud.colors is None else luminance(cloud.colors) / 255
+def _rgb(color: str) -> Array:
+    """(3,) of 255."""
+    return 255 * np.array(to_rgb(color))
+
+
+def _object_sheet(
+    name: str, cloud: Cloud, workspace: Path | None, masks: Path | None, stages: tuple[Path, ...]
+) -> Figure:
+    """Frames, masks, depth of each stage on one scale, renders, the cloud from four sides (Figure 3); the cloud alone
+    of an object that was given as one."""
+    title, sides = f"{name}: the object by itself", _sides(cloud, inner(cloud.points), point_radii(cloud.points))
+    if workspace is None or masks is None or not stages:
+        note = (
+            f"given as a cloud of {len(cloud):,} points: no stages, {'no' if workspace is None else 'its own'} photos"
+        )
+        return draw_sheet(title, note, [sides], labels=["cloud"])
+    photos = sorted(p for p in (workspace / "images").iterdir() if (masks / f"{p.stem}.png").is_file())
+    if not photos:
+        raise StageError(f"no photo in {workspace}/images has a mask in {masks}; rerun the masks stage")
+    chosen = [photos[i] for i in np.linspace(0, len(photos) - 1, len(SIDES_DEG)).round().astype(int)]
+    frames = [(p.name, read_rgb(p)) for p in chosen]
+    cut_out: list[Cell] = [
+        ("", _dim_outside(frame, read_mask(masks / f"{p.stem}.png"))) for (_, frame), p in zip(frames, chosen)
+    ]
+    rows: list[Sequence[Cell]] = [
+        frames,
+        cut_out,
+        _depth_row(photos, masks, stages),
+        _render_row(photos, stages[-1]),
+        sides,
+    ]
+    note = f"{len(photos)} frames with masks; cloud of {len(cloud):,} points; one depth scale, near bright, far dark"
+    return draw_sheet(title, note, rows, labels=["frames", "masks", "depth", "renders", "cloud"])
+
+
+def _sides(cloud: Cloud, framed: Array, radii: ArrayLike) -> list[Cell]:
+    """A cloud from four sides, all of `framed` in each picture."""
+    cameras = {azimuth: orbit_camera(framed, azimuth, 20.0, TILE_PX) for azimuth in SIDES_DEG}
+    return [(f"azimuth {azimuth:.0f}°", render(cloud, camera, radii)) for azimuth, camera in cameras.items()]
+
+
+def _depth_row(photos: list[Path], masks: Path, stages: tuple[Path, ...]) -> list[Cell]:
+    """The depth maps of the first photo that most stages have, colour-mapped on one scale over its mask."""
+    files = {p: [s / "depth_maps" / f"{p.name}.bin" for s in stages] for p in photos}
+    shown = max(photos, key=lambda photo: sum(file.is_file() for file in files[photo]))
+    maps = [read_depth(f) if f.is_file() else None for f in files[shown]]
+    mask = read_mask(masks / f"{shown.stem}.png")
+    inside = [None if d is None else np.where(_fit(mask, d.shape), d, 0.0) for d in maps]
+    known = [d[d > 0] for d in inside if d is not None and (d > 0).any()]
+    low, high = np.percentile(known[-1], [1, 99]).tolist() if known else (0.0, 1.0)
+    return [
+        (f"stage {stage}, {shown.name}", None if d is None else depth_colors(d, low, high))
+        for stage, d in enumerate(inside, 1)
+    ]
+
+
+def _render_row(photos: list[Path], stage: Path) -> list[Cell]:
+    """Two of the photos that stage 4 was measured on, and their renders."""
+    renders = [(p, file) for p in photos if (file := stage / "renders" / f"{p.stem}.png").is_file()]
+    shown = renders[:: max(1, len(renders) // 2)][:2]
+    row: list[Cell] = [("", None)] * (len(SIDES_DEG) - 2 * len(shown))
+    pairs = [((f"photo {p.name}", read_rgb(p)), ("its render, stage 4", read_rgb(file))) for p, file in shown]
+    return [cell for pair in pairs for cell in pair] + row
+
+
+def _fit(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """The mask at another size."""
+    size = (shape[1], shape[0])
+    return np.asarray(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
+
+
+def _dim_outside(picture: Image, mask: NDArray[np.bool_]) -> Image:
+    """The picture with everything outside the mask faded to a pale grey."""
+    pale = 235 - (235 - picture.astype(np.float32)) * 0.12
+    return np.where(_fit(mask, picture.shape)[..., None], picture, pale).astype(np.uint8)
+
+
+def upright(cloud: Cloud, workspace: Path) -> Cloud:
+    """The object's cloud turned so that z points up, from the photos' horizontal axes."""
+    poses = [view.world_from_cam for view in read_views(workspace / "sparse")]
+    up, _ = estimate_up(np.array([pose[:3, :3] for pose in poses]), np.array([pose[:3, 3] for pose in poses]))
+    return cloud.transformed(Sim3(1.0, rotation_between(up, UP), np.zeros(3)))
+
+
+def inner(points: Array, limit: int = 20000) -> Array:
+    """At most that many of the points, without the outermost half per cent of each axis: what a picture has to show."""
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    return points[((points >= low) & (points <= high)).all(1)][:: max(1, len(points) // limit)]
 
 
 def read_surroundings(inputs: FigureInputs) -> Surroundings:
@@ -295,44 +347,30 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
     """
     fine = read_json(inputs.fine_json)
     up = read_json(inputs.crop_json).get("up_in_scene", {}).get("value")
-    level = Sim3(1.0, rotation_between(np.array(up or [0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])), np.zeros(3))
+    level = Sim3(1.0, rotation_between(np.array(up or UP), UP), np.zeros(3))
     crop = read_cloud(inputs.crop).transformed(level)
-    pose = fine.get("scene_from_object", {}).get("value")
-    placed = None
+    pose, fused, placed = fine.get("scene_from_object", {}).get("value"), is_placed(fine), None
     if pose is not None:
         placed = read_cloud(inputs.object_cloud).transformed(level @ Sim3.from_matrix(np.array(pose)))
-    fused = is_placed(fine)
     shown = placed if fused and placed is not None else crop
     low, high = np.percentile(shown.points, [0.5, 99.5], axis=0)
-    reach = np.array(REACH) * float(np.linalg.norm(high - low))
+    reach = REACH * float(np.linalg.norm(high - low))
     scene, box = open_cloud(inputs.scene), box_around(low - reach, high + reach, level.inverse())
     clouds = scene.near(*box)[1], after_fusion(scene, inputs.checked, inputs.fused, *box)
     level_clouds = (cloud.transformed(level) for cloud in clouds)
-    before, after = (cloud[within(cloud.points, low - reach, high + reach, margin=0.0)] for cloud in level_clouds)
+    before, after = (cloud[within(cloud.points, low, high, REACH)] for cloud in level_clouds)
     if not len(before):
         raise StageError(
             f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"
         )
     unit = unit_of(load(inputs.crop_json), "diagonal") or "scene units"
-    missing, reason = _missing_cells(inputs), fine.get("reason", {}).get("value")
-    decision = ": ".join(filter(None, [value(fine, "status"), reason]))
+    decision = ": ".join(filter(None, [value(fine, "status"), fine.get("reason", {}).get("value")]))
+    missing = None
+    if (share := read_json(inputs.missing_json).get("missing", {}).get("value")) is not None:
+        missing = (read_cloud(inputs.missing) if share else Cloud(np.zeros((0, 3)))).transformed(level)
+    photos = pd.read_csv(inputs.next_photos)
+    # The middle one of the three photos of a station.
+    stations = level.apply(photos[photos.photo == 2][["x", "y", "z"]].to_numpy(np.float64))
     return Surroundings(
-        before, after, crop, placed, inner(shown.points), fused, decision, unit,
-        None if missing is None else missing.transformed(level), level.apply(read_stations(inputs.next_photos)),
+        before, after, crop, placed, inner(shown.points), fused, decision, unit, missing, stations
     )  # fmt: skip
-
-
-def _missing_cells(inputs: FigureInputs) -> Cloud | None:
-    """The cells; none where nothing is missing; None where the object has no pose or no photos."""
-    content = read_json(inputs.missing_json)
-    if "missing" not in content:
-        return None
-    share = value(content, "missing")
-    return read_cloud(inputs.missing) if share else Cloud(np.zeros((0, 3)))
-
-
-def read_stations(path: Path) -> Array:
-    """(S, 3) places of the stations in a table of photos, scene frame: the middle one of the photos of each."""
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["photo"] == "2"]
-    return np.array([[float(row[axis]) for axis in "xyz"] for row in rows]).reshape(-1, 3)

@@ -13,7 +13,7 @@ from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.photos.photo_files import photo_files
-from scenefuse.report.disk import parts_of, size_text
+from scenefuse.report.values import parts_of, size_text
 from scenefuse.sfm.matches import MatchSettings
 
 # Bytes that a feature takes in both databases of a model, with its matches; a pixel of a photo in its copies as JPEG; a

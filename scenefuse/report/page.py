@@ -4,7 +4,6 @@ Markup, style and script are files in assets/; K3D-jupyter's front end draws the
 """
 
 import base64
-import importlib.resources
 import io
 import json
 import zlib
@@ -20,9 +19,9 @@ from matplotlib.colors import to_hex
 from PIL import Image
 
 from scenefuse.core.stage import StageError
+from scenefuse.report.values import asset
 from scenefuse.report.view import LEVELS, REMOVED, UNKNOWN, Shown, View, encode
 
-ASSETS = importlib.resources.files("scenefuse.report") / "assets"
 # Of the scene, then of its objects in turn.
 SOURCE_COLORS = ("#c4c9ce", "#f07819", "#2f7fbf", "#3d9a5f", "#a45fb0", "#c9a227", "#4bb3b8", "#d1647f")
 REMOVED_COLOR, UNKNOWN_COLOR = "#b3261e", "#dfe2e5"
@@ -35,11 +34,6 @@ EVIDENCE = {
     UNKNOWN: (UNKNOWN_COLOR, "not in the completed scene"),
 }
 Mode = dict[str, Any]
-
-
-def asset(name: str) -> str:
-    """The text of a file in assets/."""
-    return (ASSETS / name).read_text(encoding="utf-8")
 
 
 def document(title: str, body: list[str], has_views: bool) -> str:

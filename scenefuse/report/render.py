@@ -227,39 +227,28 @@ def _splat(pixels, depth, slopes, radius_px, radius, rgb, width, height):  # typ
     """Colours (H, W, 3), nearest depths (H, W; inf where empty) and radii of the nearest discs (H, W), all float32."""
     surface = np.full((height, width), np.inf, dtype=np.float32)
     size = np.zeros((height, width), dtype=np.float32)
-    for i in range(len(depth)):
-        x, y, r = pixels[i, 0], pixels[i, 1], radius_px[i]
-        for v in range(max(0, int(np.floor(y - r))), min(height, int(np.floor(y + r)) + 1)):
-            for u in range(max(0, int(np.floor(x - r))), min(width, int(np.floor(x + r)) + 1)):
-                a, b = u + 0.5 - x, v + 0.5 - y
-                t = a * slopes[i, 0] + b * slopes[i, 1]
-                q = (a * a + b * b + t * t) / (r * r)
-                if q <= 1.0:
-                    # Bent away from the camera towards the rim, so that the nearest disc wins in its own middle.
-                    z = depth[i] + radius[i] * np.float32(t / r + 0.5 * q)
-                    if z < surface[v, u]:
-                        surface[v, u] = z
-                        size[v, u] = radius[i]
     picture = np.zeros((height, width, 3), dtype=np.float32)
     total = np.zeros((height, width), dtype=np.float32)
-    for i in range(len(depth)):
-        x, y, r = pixels[i, 0], pixels[i, 1], radius_px[i]
-        for v in range(max(0, int(np.floor(y - r))), min(height, int(np.floor(y + r)) + 1)):
-            for u in range(max(0, int(np.floor(x - r))), min(width, int(np.floor(x + r)) + 1)):
-                a, b = u + 0.5 - x, v + 0.5 - y
-                t = a * slopes[i, 0] + b * slopes[i, 1]
-                q = (a * a + b * b + t * t) / (r * r)
-                if q <= 1.0 and depth[i] + radius[i] * np.float32(t / r - 1.5) <= surface[v, u]:
-                    w = np.float32(1.02 - q) ** BLENDING_POWER
-                    total[v, u] += w
-                    for c in range(3):
-                        picture[v, u, c] += w * rgb[i, c]
-    for v in range(height):
-        for u in range(width):
-            if total[v, u] > 0:
-                for c in range(3):
-                    picture[v, u, c] /= total[v, u]
-    return picture, surface, size
+    for blending in (False, True):
+        for i in range(len(depth)):
+            x, y, r = pixels[i, 0], pixels[i, 1], radius_px[i]
+            for v in range(max(0, int(np.floor(y - r))), min(height, int(np.floor(y + r)) + 1)):
+                for u in range(max(0, int(np.floor(x - r))), min(width, int(np.floor(x + r)) + 1)):
+                    a, b = u + 0.5 - x, v + 0.5 - y
+                    t = a * slopes[i, 0] + b * slopes[i, 1]
+                    q = (a * a + b * b + t * t) / (r * r)
+                    # Bent away from the camera towards the rim, so that the nearest disc wins in its own middle.
+                    z = depth[i] + radius[i] * np.float32(t / r + 0.5 * q)
+                    if q > 1.0:
+                        continue
+                    if not blending and z < surface[v, u]:
+                        surface[v, u] = z
+                        size[v, u] = radius[i]
+                    if blending and depth[i] + radius[i] * np.float32(t / r - 1.5) <= surface[v, u]:
+                        w = np.float32(1.02 - q) ** BLENDING_POWER
+                        total[v, u] += w
+                        picture[v, u] += w * rgb[i]
+    return picture / np.maximum(total, np.float32(1e-30))[..., None], surface, size
 
 
 @njit(cache=True, nogil=True)

@@ -53,14 +53,10 @@ class RunInputs:
     """Result folders of the objects (results/objects/{object}); they need not exist."""
     scene_of: tuple[str, ...] = ()
     """Name of the scene that each object lies in; empty for one by itself."""
-    cloud_scenes: tuple[str, ...] = ()
-    """Names of the scenes that were given as clouds without photos."""
-    cloud_objects: tuple[str, ...] = ()
-    """Names of the objects that were."""
-    posed_scenes: tuple[str, ...] = ()
-    """Names of the scenes whose clouds were given with photos and cameras."""
-    posed_objects: tuple[str, ...] = ()
-    """Names of the objects whose were."""
+    given_scenes: tuple[Given, ...] = ()
+    """What of each scene was given; photos of all where this is empty."""
+    given_objects: tuple[Given, ...] = ()
+    """What of each object was given, likewise."""
 
 
 @dataclass(frozen=True)
@@ -147,22 +143,14 @@ def summarise(run: RunInputs) -> RunSummary:
         raise StageError(
             f"{len(run.objects)} objects but {len(run.scene_of)} scenes are given; name the scene of each object"
         )
-    scenes = {
-        folder.name: _scene(folder, run, _given(folder.name, run.cloud_scenes, run.posed_scenes))
-        for folder in run.scenes
-    }
-    objects = [
-        summarise_object(
-            folder,
-            run.variants,
-            run.jobs,
-            scene,
-            scenes[scene].missing if scene in scenes else "",
-            _given(folder.name, run.cloud_objects, run.posed_objects),
-            bool(scene) and folder.name not in run.cloud_objects and scene not in run.cloud_scenes,
-        )
-        for folder, scene in zip(run.objects, run.scene_of)
-    ]
+    given_scenes = dict(zip((folder.name for folder in run.scenes), run.given_scenes))
+    scenes = {folder.name: _scene(folder, run, given_scenes.get(folder.name, "photos")) for folder in run.scenes}
+    objects = []
+    given_objects: Sequence[Given] = run.given_objects or ["photos"] * len(run.objects)
+    for folder, scene, given in zip(run.objects, run.scene_of, given_objects):
+        linked = bool(scene) and "cloud" not in (given, given_scenes.get(scene))
+        missing = scenes[scene].missing if scene in scenes else ""
+        objects.append(summarise_object(folder, run.variants, run.jobs, scene, missing, given, linked))
     for folder in run.scenes:
         of_scene = [item for item, scene in zip(objects, run.scene_of) if scene == folder.name]
         undecided = {item.name for item in of_scene if item.status(run.variants[0]) in ("failed", "missing")}
@@ -172,11 +160,6 @@ def summarise(run: RunInputs) -> RunSummary:
             scenes[folder.name].fields.update(completed)
     failed = [f"{log.parent.name}/{log.stem}: {last_error(log) or KILLED}" for log in run.jobs.failed_logs]
     return RunSummary(list(scenes.values()), objects, run.variants, failed)
-
-
-def _given(name: str, clouds: tuple[str, ...], posed: tuple[str, ...]) -> Given:
-    """What of a scene or an object was given."""
-    return "cloud" if name in clouds else "both" if name in posed else "photos"
 
 
 def _scene(folder: Path, run: RunInputs, given: Given) -> SceneSummary:

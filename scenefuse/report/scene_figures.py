@@ -1,5 +1,6 @@
 """The figures of a scene: from above with its cameras and objects, and the 3D view before and after they were added."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pandas as pd
 from matplotlib import colormaps
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud
@@ -15,14 +17,14 @@ from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array, box_corners
 from scenefuse.photos.geodesy import length_unit
-from scenefuse.photos.sheets import Image, add_axes, new_figure, save_png, to_image
+from scenefuse.photos.sheets import TILE_PX, Cell, draw_sheet, save_png
 from scenefuse.photos.workspace import View as PhotoView
 from scenefuse.photos.workspace import read_model, read_views
 from scenefuse.report.render import MAX_DRAWN, Camera, orbit_camera, point_radii, render
 from scenefuse.report.values import read_table
-from scenefuse.report.view import REMOVED, VIEW_POINTS, View, merge, thin, within, write_view
+from scenefuse.report.view import view_of, within, write_view
 
-PANEL_PX = (704, 520)
+RED, BLUE = "#d6261f", "#0b4ea2"
 # By the number of photos, from none to nine or more.
 OVERLAP_COLORS = colormaps["RdYlGn"].resampled(10)(range(10), bytes=True)[:, :3]
 
@@ -62,7 +64,7 @@ def draw_scene(
     note = f"{len(scene):,} points{drawn}, objects (boxes): {len(boxes)}, "
     note += f"cameras (red): {len(views)}\n{_calibration(georeferenced)}" if georeferenced else "given as a cloud"
     errors = pd.DataFrame() if residuals is None else read_table(residuals)
-    save_png(figure, _scene_sheet(name, note, cloud, views, boxes, errors))
+    save_png(figure, _scene_sheet(f"Scene {name}", note, cloud, views, boxes, errors))
 
 
 def _calibration(model: Path) -> str:
@@ -75,46 +77,38 @@ def _calibration(model: Path) -> str:
 
 
 def _scene_sheet(
-    name: str, note: str, cloud: Cloud, views: list[PhotoView], boxes: dict[str, Array], errors: pd.DataFrame
-) -> Image:
+    title: str, note: str, cloud: Cloud, views: list[PhotoView], boxes: dict[str, Array], errors: pd.DataFrame
+) -> Figure:
     """The scene from above and obliquely, with boxes of 8 corners; where it has cameras, their errors and overlap."""
-    radii = point_radii(cloud.points)
+    radii, size = point_radii(cloud.points), (2 * TILE_PX[0], 2 * TILE_PX[1])
     ground = box_corners(*np.percentile(cloud.points, [1, 99], axis=0))
     centres = np.array([view.centre for view in views]).reshape(-1, 3)
-    cameras = {
-        "from above": orbit_camera(ground, -90.0, 90.0, PANEL_PX, orthographic=True),
-        "oblique": orbit_camera(np.concatenate([ground, centres]), -60.0, 30.0, PANEL_PX),
-    }
-    (width, height), gap, top = PANEL_PX, 8, 72
-    size = (2 * (width + gap) + gap, top + (height + gap) * (2 if views else 1))
-    sheet = new_figure(size)
-    sheet.text(gap / size[0], 1 - 10 / size[1], f"Scene {name}", fontsize=14, fontweight="bold", va="top")
-    sheet.text(gap / size[0], 1 - 34 / size[1], note, fontsize=9.5, color="#444444", va="top")
-
-    def panel(row: int, column: int, title: str, picture: Image) -> Any:
-        axes = add_axes(sheet, (gap + column * (width + gap), top + row * (height + gap), width, height), size)
-        axes.imshow(picture)
-        axes.set(xlim=(0, width), ylim=(height, 0))
-        axes.text(8, 22, title, fontsize=12, bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none"})
-        return axes
-
-    for column, (title, camera) in enumerate(cameras.items()):
-        axes = panel(0, column, title, render(cloud, camera, radii))
-        axes.scatter(*camera.project(centres)[0].T, s=14, c="#d6261f", edgecolors="white", linewidths=0.5, zorder=3)
+    above = orbit_camera(ground, -90.0, 90.0, size, orthographic=True)
+    oblique = orbit_camera(np.concatenate([ground, centres]), -60.0, 30.0, size)
+    rows: list[list[Cell]] = [[("from above", render(cloud, above, radii)), ("oblique", render(cloud, oblique, radii))]]
+    if views:
+        counts = sum((_frames(view, cloud.points) for view in views), np.zeros(len(cloud), np.int64))
+        most = len(OVERLAP_COLORS) - 1
+        overlap = render(cloud, above, radii, OVERLAP_COLORS[np.minimum(counts, most)])
+        errors_below = render(cloud, above, radii, (215, 215, 215))
+        rows.append(
+            [("camera positions: by photos less by GPS", errors_below), ("overlap: photos that frame a place", overlap)]
+        )
+    sheet = draw_sheet(title, note, rows, size)
+    axes: Any
+    for axes, camera in zip(sheet.axes, (above, oblique)):
+        axes.scatter(
+            *np.transpose(camera.project(centres)[0]), s=14, c=RED, edgecolors="white", linewidths=0.5, zorder=3
+        )
         for label, corners in boxes.items():
             _draw_box(axes, camera.project(corners)[0], label)
     if views:
-        camera = cameras["from above"]
-        axes = panel(1, 0, "camera positions: by photos less by GPS", render(cloud, camera, radii, (215, 215, 215)))
-        _draw_errors(axes, camera, {view.name: view.centre for view in views}, errors)
-        counts = sum((_frames(view, cloud.points) for view in views), np.zeros(len(cloud), np.int64))
-        colors = OVERLAP_COLORS[np.minimum(counts, len(OVERLAP_COLORS) - 1)]
-        axes = panel(1, 1, "overlap: photos that frame a place", render(cloud, camera, radii, colors))
         for number, color in enumerate(OVERLAP_COLORS):
-            label = f"{number}" + (" or more" if number == len(OVERLAP_COLORS) - 1 else "")
-            axes.plot([], [], "s", color=color / 255, label=label)
-        axes.legend(loc="lower center", ncols=len(OVERLAP_COLORS), fontsize=9, handletextpad=0, columnspacing=0.6)
-    return to_image(sheet)
+            label = f"{number}" + (" or more" if number == most else "")
+            sheet.axes[3].plot([], [], "s", color=color / 255, label=label)
+        sheet.axes[3].legend(loc="lower center", ncols=most + 1, handletextpad=0, columnspacing=0.6)
+        _draw_errors(sheet.axes[2], above, {view.name: view.centre for view in views}, errors)
+    return sheet
 
 
 def _frames(view: PhotoView, points: Array) -> NDArray[np.bool_]:
@@ -128,7 +122,7 @@ def _draw_errors(axes: Any, camera: Camera, centres: dict[str, Array], errors: p
     errors = errors[errors.kind == "position"].dropna(subset=["east_m", "north_m"]) if len(errors) else errors
     errors = errors[errors.name.isin(centres)] if len(errors) else errors
     if errors.empty:
-        axes.text(8, 46, "no positions by GPS to compare with", fontsize=10)
+        axes.set_title("no positions by GPS to compare with")
         return
     pixels = camera.project(np.array([centres[name] for name in errors.name]))[0]
     sides = errors[["east_m", "north_m"]].abs().to_numpy()
@@ -144,8 +138,8 @@ def _draw_errors(axes: Any, camera: Camera, centres: dict[str, Array], errors: p
     axes.add_collection(shapes)
     axes.scatter(*pixels.T, s=5, c="black", zorder=4)
     scale = axes.figure.colorbar(shapes, cax=axes.inset_axes((0.7, 0.1, 0.27, 0.025)), orientation="horizontal")
-    scale.set_label("upwards (m)", fontsize=9)
-    axes.text(8, camera.height_px - 14, f"east and north enlarged {factor:,.0f} times", fontsize=10)
+    scale.set_label("upwards (m)")
+    axes.set_title(f"{axes.get_title()}, east and north enlarged {factor:,.0f} times", fontsize="medium", pad=3)
 
 
 def _draw_box(axes: Any, corners_px: Array, label: str) -> None:
@@ -153,10 +147,10 @@ def _draw_box(axes: Any, corners_px: Array, label: str) -> None:
     for a in range(8):
         for bit in (1, 2, 4):
             if not a & bit:
-                axes.plot(*corners_px[[a, a | bit]].T, color="#0b4ea2", linewidth=1.2, zorder=4)
-    x, y = corners_px[:, 0].mean(), corners_px[:, 1].min() - 6
+                axes.plot(*corners_px[[a, a | bit]].T, color=BLUE, linewidth=1.2)
+    place = corners_px[:, 0].mean(), corners_px[:, 1].min()
     box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.5}
-    axes.text(x, y, label, ha="center", va="bottom", fontsize=9.5, color="#0b4ea2", zorder=5, bbox=box)
+    axes.text(*place, label, ha="center", va="bottom", color=BLUE, zorder=5, bbox=box)
 
 
 def view_scene(*, dense: Path, completed: Path, completed_json: Path, georeference_json: Path, folder: Path) -> None:
@@ -175,27 +169,21 @@ def view_scene(*, dense: Path, completed: Path, completed_json: Path, georeferen
     scene, whole, about = open_cloud(dense), open_cloud(completed), read_json(completed_json)
     sources = {int(number): name for number, name in value(about, "sources").items()}
     every = max(1, -(-len(scene) // MAX_DRAWN))
-    boxes = _objects(whole, value(about, "scene_points"))
+    # A tile of an object lies behind those of the scene's points.
+    tiles = np.flatnonzero(whole.starts[:-1] >= value(about, "scene_points"))
+    boxes = list(zip(whole.low[tiles], whole.high[tiles]))
     before, after = _read(scene, every, boxes), _read(whole, every, boxes)
     # Stray points far out would take the precision of the positions, and the picture.
     low, high = np.percentile(before.points[_evenly(before.points, every)], [0.1, 99.9], axis=0)
     before, after = (cloud[within(cloud.points, low, high, margin=0.1)] for cloud in (before, after))
     low, high = np.percentile(before.points[_evenly(before.points, every)], [1, 99], axis=0)
-    counts = (len(before), len(after)) if every == 1 else (len(scene), len(whole))
-    points = merge(before, after)
-    points.fields["near"][:] = _near_objects(points)
-    thinned = thin(points, VIEW_POINTS)
-    unit = length_unit(georeference_json)
     # As in the scene's figure, a little higher: the objects do not hide each other.
-    write_view(folder, View(thinned, sources, unit, low, high, -60.0, 35.0, *counts))
+    view = view_of(before, after, low, high, sources, length_unit(georeference_json), -60.0, 35.0, boxes)
+    if every > 1:
+        view = replace(view, before_points=len(scene), after_points=len(whole))
+    write_view(folder, view)
     of = "" if every == 1 else f"; of the scene away from its objects one in {every} was looked at"
-    print(f"{folder}/view.ply: {len(thinned):,} of {len(points):,} points{of}", flush=True)
-
-
-def _objects(completed: TiledCloud, scene_points: int) -> list[tuple[Array, Array]]:
-    """Boxes around what each object added: its tile lies behind those of the scene's points."""
-    tiles = np.flatnonzero(completed.starts[:-1] >= scene_points)
-    return list(zip(completed.low[tiles], completed.high[tiles]))
+    print(f"{folder}/view.ply: {len(view.cloud):,} points{of}", flush=True)
 
 
 def _read(cloud: TiledCloud, every: int, boxes: list[tuple[Array, Array]]) -> Cloud:
@@ -214,16 +202,3 @@ def _evenly(points: Array, every: int) -> NDArray[np.bool_]:
     bits = np.ascontiguousarray(points).view(np.uint64)
     mixed = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)).sum(1)
     return np.asarray((mixed >> np.uint64(33)) % np.uint64(every) == 0)
-
-
-def _near_objects(points: Cloud) -> NDArray[np.bool_]:
-    """(N,) whether points lie in the box of what was added from an object; all where nothing was added."""
-    source = points.fields["source"]
-    boxes = [
-        np.percentile(points.points[source == number], [1, 99], axis=0)
-        for number in np.unique(source)
-        if number not in (0, REMOVED)
-    ]
-    if not boxes:
-        return np.ones(len(points), dtype=bool)
-    return np.any([within(points.points, low, high) for low, high in boxes], axis=0)

@@ -10,90 +10,32 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import yaml
 
-from scenefuse.fuse.missing import Lack
 from scenefuse.metrics.completion import MEASURES
 from scenefuse.metrics.scores import SCORES, THRESHOLDS
 from scenefuse.report.diagnosis import diagnose
 from scenefuse.report.facts import ground_pixel, photographed
 from scenefuse.report.run_summary import RunSummary, SceneSummary, why_missing
-from scenefuse.report.values import Fields, find, number, unit_of
+from scenefuse.report.values import Fields, asset, find, number, parts_of, unit_of
 
 # Of the jobs of a rule: by the clock, of the processor, and as they were forecast.
 SECONDS = ("seconds", "processor_seconds", "forecast_seconds")
 # What stands beside the value of a completion metric.
 BESIDE = ("null", "before", "after")
-# Columns of the tables, and where each value stands: the first that is there.
-REGISTRATION = {
-    **{name: f"fine.{name}" for name in ("scale", "f_score", "margin")},
-    **{
-        name: f"metrics.registration.{name}"
-        for name in (
-            *("fitness", "fitness_source", "fitness_f_score", "inlier_rmse", "inlier_rmse_over_diagonal"),
-            *("normal_consistency", "normal_consistency_self", "tau"),
-        )
-    },
-    **{
-        name: f"truth.{name}"
-        for name in (
-            *("scale_error_pct", "rotation_error_deg", "translation_error_over_diagonal"),
-            "placed_f_score_1pct",
-        )
-    },
-}
-CAMERAS = {"registered": "sparse.registered", "reprojection_error_px": "sparse.mean_reprojection_error_px"}
-SURVEYED = tuple(
-    f"{kind}_{name}" for kind in ("control", "check") for name in ("points", "rms_horizontal_m", "rms_vertical_m")
-)
-SCENE = {
-    "photos": "sparse.total photos.count",
-    **CAMERAS,
-    "latitude_deg": "georeference.origin_latitude_deg",
-    "longitude_deg": "georeference.origin_longitude_deg",
-    **{name: f"georeference.{name}" for name in ("crs", "length_unit", "gps_residual_median_m", *SURVEYED)},
-    **{f"gps_rms_{way}_m": f"georeference.gps_residual_{way}_rms_m" for way in ("horizontal", "vertical")},
-    **{name: f"dense.{name}" for name in ("points", "spacing", "backend")},
-    "completed_points": "completed.points",
-}
-OBJECT = {
-    **{name: f"fine.{name}" for name in ("decided_by", "scale_sd_log")},
-    **{f"surface_{name}": f"missing.{name}" for name in ("missing", *(lack.name.lower() for lack in Lack))},
-    **{name: f"fusion.{name}" for name in ("added_points", "removed_points")},
-    "measured_share": "evidence.object_measured_share",
-    **{name: f"metrics.object.{name}" for name in ("deviation", "world_deviation")},
-    **{name: f"missing.{name}" for name in ("stations", "stations_show")},
-    "frames": "sparse.total photos.count",
-    **CAMERAS,
-    "masks": "masks.masks",
-    "mask_iou": "truth.mask_iou_mean",
-    **{
-        f"stage{stage}_{column}": f"stage{stage}.{name}"
-        for stage in (2, 4)
-        for column, name in {"psnr_db": "psnr_held_out", "ssim": "ssim", "measured_on": "measured_on"}.items()
-    },
-    **{
-        f"stage{stage}_{column}": f"truth.stage{stage}_{name}"
-        for stage in (1, 2, 3, 4)
-        for column, name in {
-            "depth_error_over_diagonal": "depth_error",
-            "depth_within_1pct": "depth_within_1pct",
-        }.items()
-    },
-    "points": "object.points",
-    "cloud_accuracy_median_pct_of_diagonal": "truth.cloud_accuracy_median",
-    **{f"cloud_{s}_{t}": f"truth.cloud_{s}_{t}" for t, s in itertools.product(THRESHOLDS, SCORES)},
-}
+# Columns of the tables and lines of details.txt, and where each value stands.
+QUANTITIES: dict[str, dict[str, Any]] = yaml.safe_load(asset("quantities.yaml"))
 
 
 def registration_table(run: RunSummary) -> pd.DataFrame:
     """One row an object and variant: status, reason, scores, errors against truth; lengths in the scene's unit."""
     rows = [
         {"object": item.name, "variant": variant, "status": item.status(variant), "reason": item.reason(variant)}
-        | _columns(item.variants[variant], REGISTRATION)
+        | _columns(item.variants[variant], "registration")
         for item in run.objects
         for variant in run.variants
     ]
-    return pd.DataFrame(rows, columns=["object", "variant", "status", "reason", *REGISTRATION])
+    return pd.DataFrame(rows, columns=["object", "variant", "status", "reason", *QUANTITIES["columns"]["registration"]])
 
 
 def completion_table(run: RunSummary) -> pd.DataFrame:
@@ -146,6 +88,16 @@ def runtime_table(benchmarks: Path, forecast: Mapping[str, float]) -> pd.DataFra
     return table
 
 
+def disk_table(folders: Sequence[Path]) -> pd.DataFrame:
+    """Disk space of the parts of result folders: name (such as `scenes/{scene}`), part, megabytes; largest first."""
+    rows = [
+        {"name": f"{folder.parent.name}/{folder.name}", "part": part, "megabytes": size / 1e6}
+        for folder in folders
+        for part, size in sorted(parts_of(folder).items(), key=lambda item: (-item[1], item[0]))
+    ]
+    return pd.DataFrame(rows, columns=["name", "part", "megabytes"])
+
+
 def scenes_table(scenes: list[SceneSummary], folders: Sequence[Path]) -> pd.DataFrame:
     """One row a scene: photos, cameras, georeference, cloud, metrics of the completed scene, errors against truth.
 
@@ -156,7 +108,7 @@ def scenes_table(scenes: list[SceneSummary], folders: Sequence[Path]) -> pd.Data
     rows = []
     for scene, folder in zip(scenes, folders):
         fields, added = scene.fields, find(scene.fields, "completed.added_points")
-        row: dict[str, Any] = {"scene": scene.name} | _columns(fields, SCENE)
+        row: dict[str, Any] = {"scene": scene.name} | _columns(fields, "scenes")
         if "georeference.length_unit" in fields:
             row |= {"photographed": photographed(folder), "ground_pixel": ground_pixel(folder / "georeferenced")}
         row["completed_by"] = None if added is None else ", ".join(added) or "none"
@@ -180,7 +132,7 @@ def objects_table(run: RunSummary) -> pd.DataFrame:
         rows.append(
             {"object": item.name, "status": item.status(variant), "reason": item.reason(variant)}
             | dict(zip(("length", "width", "height"), size))
-            | _columns(fields, OBJECT)
+            | _columns(fields, "objects")
             | {"unit": unit or unit_of(fields, "crop.diagonal")}
             | {"missing": item.missing or None, "error": why_missing(item.failed) if item.missing else None}
             | {"advice": "; ".join(diagnose(item)) or None}
@@ -206,9 +158,9 @@ def plain(item: Any) -> Any:
     return ", ".join(number(v) for v in item) if isinstance(item, list) else item
 
 
-def _columns(fields: Fields, columns: dict[str, str]) -> dict[str, Any]:
+def _columns(fields: Fields, table: str) -> dict[str, Any]:
     """The cells of a row."""
-    return {name: plain(find(fields, *keys.split())) for name, keys in columns.items()}
+    return {name: plain(find(fields, *keys.split())) for name, keys in QUANTITIES["columns"][table].items()}
 
 
 def _measure(key: str) -> tuple[str, str]:

@@ -1,7 +1,10 @@
-"""Reading stage JSONs that may lack anything: nested quantities as one flat table, numbers as short text."""
+"""What stages left, which may lack anything: quantities as one flat table, sizes on the disk, numbers as short text."""
 
+import importlib.resources
 import json
 import math
+import os
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +12,13 @@ from typing import Any
 import pandas as pd
 
 Fields = dict[str, dict[str, Any]]
+TEMPORARY = ".tmp-"
+ASSETS = importlib.resources.files("scenefuse.report") / "assets"
+
+
+def asset(name: str) -> str:
+    """The text of a file in assets/."""
+    return (ASSETS / name).read_text(encoding="utf-8")
 
 
 def flatten(content: Mapping[str, Any], prefix: str = "") -> Fields:
@@ -89,3 +99,27 @@ def length(value: float, unit: str) -> str:
         value, unit = (1000 * value, "mm") if abs(value) < 0.1 else (100 * value, "cm")
     digits = f"{value:#.3g}".rstrip(".") if abs(value) < 999.5 else f"{value:,.0f}"
     return f"{digits} {unit}"
+
+
+def parts_of(folder: Path) -> dict[str, int]:
+    """Bytes of the files in a folder, and of those below each folder in it; links take none. Temporary files of
+    running jobs are left out."""
+    parts: dict[str, int] = {}
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if TEMPORARY not in name]
+        below = Path(place).relative_to(folder).parts
+        for name in names:
+            try:
+                status = os.lstat(os.path.join(place, name))
+            except OSError:
+                continue
+            if TEMPORARY not in name and not stat.S_ISLNK(status.st_mode):
+                part = below[0] if below else name
+                parts[part] = parts.get(part, 0) + status.st_size
+    return parts
+
+
+def size_text(size: float) -> str:
+    """Bytes in words, such as 1.2 GB."""
+    unit, name = next((u, n) for u, n in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")) if size >= 0.1 * u or n == "MB")
+    return f"{size / unit:.3g} {name}"

@@ -9,6 +9,7 @@ that they compress; everything else in 8 bits or less. About 8 bytes a point aft
 """
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
@@ -45,6 +46,8 @@ class Shown(IntEnum):
 REMOVED = UNKNOWN = 255
 # Points of one view: with three objects and a scene, the page stays well below 15 MB.
 VIEW_POINTS = 175_000
+# How far around an object its view and its figures show the scene, over the object's diagonal.
+REACH = 0.35
 # How much farther apart points stand that are not near: a reader looks at the objects.
 SURROUNDINGS_SPACING = 2.0
 # Three axes of a position in one integer: two points in one cell, a twentieth of a millimetre on 100 m, are the same.
@@ -99,6 +102,25 @@ def merge(before: Cloud, after: Cloud) -> Cloud:
     second = _with_fields(after, after.fields.get("source", np.zeros(len(after))), Shown.BOTH, after)
     second.fields["shown"][only_after] = Shown.AFTER
     return concatenate([first, second]) if len(first) else second
+
+
+def view_of(
+    before: Cloud,
+    after: Cloud,
+    low: Array,
+    high: Array,
+    sources: dict[int, str],
+    unit: str,
+    azimuth_deg: float,
+    elevation_deg: float = 20.0,
+    near: Sequence[tuple[Array, Array]] = (),
+) -> View:
+    """Both clouds as one thinned view of the box from `low` to `high`; near is what lies in the boxes `near`, else in
+    that one."""
+    points = merge(before, after)
+    points.fields["near"][:] = np.any([within(points.points, *box) for box in near or [(low, high)]], axis=0)
+    counts = len(before), len(after)
+    return View(thin(points, VIEW_POINTS), sources, unit, low, high, azimuth_deg, elevation_deg, *counts)
 
 
 def thin(points: Cloud, limit: int) -> Cloud:

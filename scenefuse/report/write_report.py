@@ -11,11 +11,11 @@ import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.version import VERSION
-from scenefuse.report.facts import object_facts, scene_facts, surface_facts
-from scenefuse.report.page import asset, document, embedded, figure, view_section
+from scenefuse.report.facts import WORDS, object_facts, scene_facts, surface_facts
+from scenefuse.report.page import document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
 from scenefuse.report.tables import records
-from scenefuse.report.values import number, read_table
+from scenefuse.report.values import asset, number, read_table
 from scenefuse.report.view import View, read_view, thin
 
 # Of all 3D views together: about 8 MB. With more views than fit, each gets fewer points.
@@ -24,7 +24,6 @@ PAGE_POINTS = 700_000
 UNFINISHED = ("failed", "missing")
 # Others look before as after.
 ADDED = ("registered", "ungated")
-BADGES = {"registered": "completed", "unregistered": "not added", "ungated": "not checked", "missing": "not run"}
 Row = dict[str, Any]
 Texts = dict[str, Any]
 
@@ -112,10 +111,8 @@ def _scene_facts(name: str, row: Row) -> str:
 
 def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str:
     """One object: result, picture before and after, facts, 3D view, what is missing, masks."""
-    status = row["status"]
-    badge = (
-        f'<span class="badge {"ok" if status in ("registered", ALONE) else "no"}">{BADGES.get(status, status)}</span>'
-    )
+    status, word = row["status"], WORDS["badges"].get(row["status"], row["status"])
+    badge = f'<span class="badge {"ok" if status in ("registered", ALONE) else "no"}">{word}</span>'
     parts = [f'<section class="card" id="{escape(folder.name)}"><h2>{escape(folder.name)}{badge}</h2>']
     is_finished, figures = status not in UNFINISHED, folder / "figures"
     pictures = [_slider(figures)] if status in ADDED and (figures / "before.png").is_file() else []

@@ -10,11 +10,9 @@ from scenefuse.core.stage import atomic_file, value
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.report.page import document, figure, view_section
 from scenefuse.report.values import flatten, number
-from scenefuse.report.view import REMOVED, VIEW_POINTS, View, merge, thin, within
+from scenefuse.report.view import REACH, View, view_of, within
 from scenefuse.two_clouds.complete import Completed
 
-# How far around the object the view shows the scene, over the object's diagonal.
-VIEW_REACH = 0.35
 ROWS = {
     "scale": "scale",
     "scale_sd_log": "its standard deviation (log)",
@@ -55,7 +53,7 @@ def write_page(
         parts.append(f"<p>The pose was refused, so there is no completed scene. {escape(value(content, 'next'))}.</p>")
     else:
         scene_points = inputs["scene_points"] - len(done.removed)
-        parts += [_changes(done, scene_points), view_section("scene", title, view_of(names[0], done, up, unit))]
+        parts += [_changes(done, scene_points), view_section("scene", title, view_of_scene(names[0], done, up, unit))]
     if picture.is_file():
         caption = "From above, from the front and from the side: scene grey, object orange; below in their own colours."
         parts.append(figure(picture, caption))
@@ -69,26 +67,23 @@ def write_page(
         temporary.write_text(document(title, parts, done is not None), encoding="utf-8")
 
 
-def view_of(name: str, done: Completed, up: Array | None, unit: str) -> View:
+def view_of_scene(name: str, done: Completed, up: Array | None, unit: str) -> View:
     """The 3D view of the completed scene around what was added, before and after."""
     level = Sim3(1.0, rotation_between(UP if up is None else up, UP), np.zeros(3))
     added = done.added if len(done.added) else done.before
     corners = np.percentile(added.points, [0.5, 99.5], axis=0)
     middle = np.floor(corners.mean(0))
     level = level @ Sim3(1.0, np.eye(3), -middle)
-    reach = (0.5 + VIEW_REACH) * float(np.linalg.norm(corners[1] - corners[0]))
+    reach = (0.5 + REACH) * float(np.linalg.norm(corners[1] - corners[0]))
     before, after = (
         cloud[within(cloud.points, middle - reach, middle + reach, margin=0.0)].transformed(level)
         for cloud in (done.before, done.after)
     )
     low, high = np.percentile(added.transformed(level).points, [0.5, 99.5], axis=0)
-    points = merge(before, after)
-    points.fields["near"][:] = within(points.points, low, high)
-    thinned = thin(points, VIEW_POINTS)
-    found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
-    names = {done.source: f"added from {name}"}
-    sources = {0: "scene"} | {code: names.get(code, f"{code} in the scene") for code in found}
-    return View(thinned, sources, unit, low, high, -60.0, 20.0, len(before), len(after))
+    numbers = np.unique(after.fields.get("source", np.zeros(1, np.int64))).tolist()
+    names = {0: "scene", done.source: f"added from {name}"}
+    sources = {code: names.get(code, f"{code} in the scene") for code in numbers}
+    return view_of(before, after, low, high, sources, unit, -60.0)
 
 
 def _changes(done: Completed, scene_points: int) -> str:

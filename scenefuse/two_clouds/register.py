@@ -34,8 +34,9 @@ from scenefuse.register.register import (
     search_box,
     summary,
 )
+from scenefuse.report.view import REACH
 from scenefuse.two_clouds.complete import complete, fusion_settings, write_files
-from scenefuse.two_clouds.page import VIEW_REACH, write_page
+from scenefuse.two_clouds.page import write_page
 
 NOTHING = Known()
 # How many times as large as the scene's part that shows it an object may be, and as that part's spacing it has to be.
@@ -285,7 +286,7 @@ def _fuse(
     written, done = list[Path](), None
     if found.registered and found.scene_from_object is not None:
         pose = found.scene_from_object
-        around = VIEW_REACH * given.object.transformed(pose).diagonal
+        around = REACH * given.object.transformed(pose).diagonal
         done = complete(given.object, given.scene, pose, fusion_settings(config), around)
         written += write_files(out, done, inputs["object"], given.scene)
     page = out / "report.html"

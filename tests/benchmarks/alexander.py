@@ -18,7 +18,7 @@ from scenefuse.masks.make_masks import MaskInputs, make_masks
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.masks.supplied import supplied_masks
 from scenefuse.photos.workspace import read_workspace
-from scenefuse.report.object_sheet import inner, upright
+from scenefuse.report.figures import inner, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
 
 EXAMPLE = ROOT / "config/examples/alexander"

@@ -2,7 +2,8 @@
 
 import os
 
-from scenefuse.report.disk import disk_table, parts_of
+from scenefuse.report.tables import disk_table
+from scenefuse.report.values import parts_of
 
 
 def test_parts_are_counted_once_and_links_are_not(tmp_path):

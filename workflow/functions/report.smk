@@ -72,10 +72,8 @@ def run_options(wildcards=None):
     """What the run works on, and where it leaves results and records, as options; also a params function."""
     given = {
         "scene_of": [row.get("scene", "") for row in OBJECTS.values()],
-        "cloud_scenes": CLOUD_SCENES,
-        "cloud_objects": CLOUD_OBJECTS,
-        "posed_scenes": POSED_SCENES,
-        "posed_objects": POSED_OBJECTS,
+        "given_scenes": [what_is_given(row) for row in SCENES.values()],
+        "given_objects": [what_is_given(row) for row in OBJECTS.values()],
     }
     given = flags({name: found for name, found in given.items() if found})
     return (
