@@ -197,7 +197,7 @@ def find_in_scene(
     up_in_scene: Array | None = None,
     scales: ScaleRange | None = None,
     unit: str = "scene units",
-) -> tuple[Registration, Cloud, int]:
+) -> tuple[Registration, Cloud, list[tuple[float, Array]]]:
     """Find where an object lies in a scene that may be thirty times as wide (method R16).
 
     It is registered in the whole scene, as if that showed little else, and in each of `likely_places`. The best has to
@@ -208,7 +208,8 @@ def find_in_scene(
         up_in_scene: unit vector (3,), opposite to gravity; None where it is not known.
 
     Returns:
-        The best registration, the part of the scene that it was found in, and at how many places it was tried.
+        The best registration, the part of the scene that it was found in, and the places where it was tried, the best
+        first: the score and the corners (2, 3) of the part of the scene.
 
     Raises:
         StageError: as of `register_clouds`.
@@ -220,7 +221,9 @@ def find_in_scene(
     found, part = max(tried, key=lambda one: (one[0].registered, one[0].total))
     if len(tried) > 1:
         found = _unless_elsewhere(found, [other for other, _ in tried], obj, settings.fine)
-    return with_agreement(found, obj, part, settings, seed), part, len(tried) - 1
+    ranked = sorted(tried[1:], key=lambda one: -one[0].total)
+    places = [(one.total, np.stack([there.points.min(0), there.points.max(0)])) for one, there in ranked]
+    return with_agreement(found, obj, part, settings, seed), part, places
 
 
 def _unless_elsewhere(

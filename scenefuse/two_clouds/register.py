@@ -118,12 +118,13 @@ def register(
         _check_size(scales, given)
     crs = las_crs(scene)
     unit = "scene units" if crs is None else unit_and_name(crs)[0]
+    places: list[tuple[float, Array]] = []
     if known.fiducials is None and known.crop_box is None:
         found, part, places = find_in_scene(
             given.object, given.scene.part, settings, seed, ups=given.ups, up_in_scene=known.ups()[1], scales=scales,
             unit=unit,
         )  # fmt: skip
-        searched = f"{given.searched}, and {places} places in it that look like the object"
+        searched = f"{given.searched}, and {len(places)} places in it that look like the object"
         given = replace(given, scene=replace(given.scene, part=part), searched=searched)
     else:
         found = register_clouds(given.object, given.scene.part, settings, seed, ups=given.ups, scales=scales, unit=unit)
@@ -139,9 +140,12 @@ def register(
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
     if not found.registered:
-        content["next"] = quantity(_advice(known), "")
+        content["next"] = quantity(_advice(known, len(places)), "")
+        content["places"] = quantity([{"score": score, "crop_box": box.ravel()} for score, box in places], unit)
     print("\n".join(summary(found, given.searched, given.ups, evidence)), flush=True)
     if not found.registered:
+        for score, box in places:
+            print(f"place      score {score:.2f}  --crop-box {_corners(box)}", flush=True)
         print(f"next       {value(content, 'next')}", flush=True)
     written = _write(out, format, given, found, scene, seed)
     if fuse:
@@ -153,13 +157,19 @@ def register(
     return ExitStatus.REGISTERED if found.registered else ExitStatus.UNREGISTERED
 
 
-def _advice(known: Known) -> str:
+def _advice(known: Known, places: int) -> str:
     """What a user can do about a refusal."""
     if known.fiducials is None and known.crop_box is None:
-        return (
-            f"mark the object in the scene by --fiducials or --crop-box; {ROOT}/docs/register.md lists further causes"
-        )
+        one = "give the --crop-box of the place above that is right, or " if places else ""
+        further = f"{ROOT}/docs/register.md lists further causes"
+        return f"{one}mark the object in the scene by --fiducials or --crop-box; {further}"
     return f"{ROOT}/docs/register.md lists causes and what to do about each"
+
+
+def _corners(box: Array) -> str:
+    """The least and the greatest corner of a box (2, 3) as numbers to be pasted, to about a thousandth of its size."""
+    decimals = max(0, 3 - int(np.floor(np.log10(np.ptp(box, axis=0).max()))))
+    return " ".join(f"{x:.{decimals}f}" for x in box.ravel())
 
 
 def _clear(out: Path, inputs: list[Path]) -> None:

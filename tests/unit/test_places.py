@@ -49,7 +49,7 @@ def test_a_house_is_found_in_a_landscape_ten_times_as_wide(yard):
         0.02 * yard.diagonal
     )
     assert abs(found.scene_from_object.scale / yard.scene_from_object.scale - 1) < 0.02
-    assert len(part) < 0.2 * len(yard.scene) and places == 2
+    assert len(part) < 0.2 * len(yard.scene) and len(places) == 2
 
 
 def tried(total, at, registered=True, precision=0.7):
@@ -69,31 +69,31 @@ def chosen(monkeypatch, yard, *there):
     monkeypatch.setattr(register, "register_once", lambda *known: next(there))
     monkeypatch.setattr(register, "with_agreement", lambda found, *known: found)
     monkeypatch.setattr(register, "likely_places", lambda *known: [np.arange(300), np.arange(300, 600)])
-    return find_in_scene(yard.object, yard.scene, LITTLE, 0)[0]
+    return find_in_scene(yard.object, yard.scene, LITTLE, 0)
 
 
 def test_the_best_place_that_passes_the_gate_is_taken(monkeypatch, yard):
     far = [3 * yard.object.diagonal, 0, 0]
-    found = chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.4, far))
+    found, _, _ = chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.4, far))
     assert found.registered and found.total == 0.8
     # The margin is the lead over the next place where that is less than over other poses.
     assert found.outcome.decision.margin == 0.5
-    found = chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.6, far))
+    found, _, _ = chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.6, far))
     assert found.outcome.decision.margin == pytest.approx(0.25)
 
 
 def test_an_object_that_fits_two_places_is_refused(monkeypatch, yard):
     far = [3 * yard.object.diagonal, 0, 0]
     for passes in (True, False):
-        found = chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.79, far, passes))
+        found, _, _ = chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.79, far, passes))
         assert not found.registered and "another place is nearly as good, at (" in found.reason
     # The same place twice, by the whole scene and by a part of it, is one.
     near = [0.03 * yard.object.diagonal, 0, 0]
-    assert chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.79, near)).registered
+    assert chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.79, near))[0].registered
 
 
 def test_an_object_that_fits_nowhere_may_not_be_there(monkeypatch, yard):
-    found = chosen(
+    found, _, _ = chosen(
         monkeypatch,
         yard,
         tried(0.1, [0, 0, 0], False),
@@ -102,6 +102,14 @@ def test_an_object_that_fits_nowhere_may_not_be_there(monkeypatch, yard):
     )
     assert not found.registered
     assert found.reason.startswith("the best place shows 12% of the object, which may not be in this scene: its own")
+
+
+def test_places_are_ranked_by_their_scores_each_with_its_box(monkeypatch, yard):
+    tries = tried(0.1, [0, 0, 0], False), tried(0.2, [0, 0, 0], False), tried(0.3, [9, 0, 0], False)
+    places = chosen(monkeypatch, yard, *tries)[2]
+    assert [score for score, _ in places] == [0.3, 0.2]
+    points = yard.scene.points[300:600]
+    assert np.array_equal(places[0][1], [points.min(0), points.max(0)])
 
 
 def test_a_scene_without_a_raised_part_has_no_place(yard):

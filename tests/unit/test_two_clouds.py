@@ -22,9 +22,10 @@ from scenefuse.core.stage import StageError, quantity, read_json, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.core.version import VERSION
 from scenefuse.fuse.modes import FusionSettings
+from scenefuse.register import register as register_module
 from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.register import RegistrationSettings
+from scenefuse.register.register import Known, RegistrationSettings
 from scenefuse.two_clouds.complete import append_to_las, complete, write_files
 from scenefuse.two_clouds.page import write_page
 from scenefuse.two_clouds.register import register
@@ -330,6 +331,25 @@ def test_a_refused_pose_leaves_no_completed_scene_and_nothing_of_an_earlier_run(
     assert sorted(path.name for path in out.iterdir()) == ["picture.png", "report.html", "transform.json"]
     page = (out / "report.html").read_text()
     assert "unregistered" in page and "The pose was refused" in page
+
+
+def test_a_refusal_ends_in_places_whose_boxes_can_be_pasted(tmp_path, house, monkeypatch, capsys):
+    registered_at_once(monkeypatch, house.scene_from_object, registered=False)
+    rows = np.flatnonzero(house.scene.points[:, 0] > np.median(house.scene.points[:, 0]))
+    monkeypatch.setattr(register_module, "likely_places", lambda *known: [rows])
+    for name, cloud in (("house", house.object), ("yard", house.scene)):
+        write_cloud(tmp_path / f"{name}.ply", cloud)
+    known = {"object": tmp_path / "house.ply", "scene": tmp_path / "yard.ply", "out": tmp_path / "out"}
+    assert register(**known) == 3
+    said = capsys.readouterr().out
+    box = tuple(map(float, re.search(r"^place +score 0\.00  --crop-box (.*)$", said, re.MULTILINE)[1].split()))
+    points = house.scene.points[rows]
+    np.testing.assert_allclose(box, [*points.min(0), *points.max(0)], atol=1e-3 * np.ptp(points, axis=0).max())
+    assert "give the --crop-box of the place above that is right, or mark the object" in said
+    written = value(read_json(tmp_path / "out/transform.json"), "places")
+    assert len(written) == 1 and len(written[0]["crop_box"]) == 6
+    assert register(**known, known=Known(crop_box=box)) == 3
+    assert "place " not in capsys.readouterr().out
 
 
 def test_noise_of_a_laz_is_not_searched_and_stays_in_the_completed_laz_alone(tmp_path, house, monkeypatch, capsys):
