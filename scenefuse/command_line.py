@@ -97,7 +97,7 @@ def _export() -> None:
     """make what is handed over of finished objects: surfaces, drawings, cameras"""
     parser = argparse.ArgumentParser(
         prog="scenefuse export",
-        description="Make surfaces, drawings and cameras of finished objects, and show them in the report."
+        description="Make surfaces, drawings, cameras and 3D Tiles of finished objects, and show them in the report."
         " Nothing before them runs again.",
         epilog="All other options are those of scenefuse run, as -n to see what would be made.",
     )
@@ -111,11 +111,12 @@ def _export() -> None:
         sys.exit(f"error: {which} a results/objects/NAME/fused.ply here; run the workflow first (scenefuse run)")
     names = sorted(words.names or finished)
     scenes = sorted(path.parent.name for path in Path().glob("results/scenes/*/dense.ply"))
-    # Given clouds have no cameras.
-    what = [item for item in words.what if item != "cameras" or any(Path().glob("results/*/*/undistorted"))]
+    # Given clouds have no cameras, and a scene that was not completed has no tiles.
+    needed = {"cameras": "results/*/*/undistorted", "tiles": "results/scenes/*/completed.ply"}
+    what = [item for item in words.what if any(Path().glob(needed.get(item, "*")))]
     targets = {EXPORTS[item].format(object=name, scene=scene) for item in what for name in names for scene in scenes}
     run = [sys.executable, "-m", "scenefuse", "run"]
-    rules = ["make_surface", "draw_surface", "export_cameras"]
+    rules = ["make_surface", "draw_surface", "export_cameras", "make_tiles"]
     ended = subprocess.run([*run, *sorted(targets), *others, "--allowed-rules", *rules]).returncode
     if ended or {"-n", "--dry-run", "--dryrun"} & set(others):
         sys.exit(ended)
@@ -190,6 +191,7 @@ EXPORTS = {
     "surface": "results/objects/{object}/surface.glb",
     "drawings": "results/objects/{object}/drawings",
     "cameras": "results/scenes/{scene}/cameras",
+    "tiles": "results/scenes/{scene}/tiles",
 }
 PARTS: dict[str, Callable[[], None]] = {
     "complete": _complete,

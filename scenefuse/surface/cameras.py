@@ -1,29 +1,37 @@
 """The cameras of a scene and of its objects together in the scene's frame, for who textures or draws elsewhere."""
 
 import os
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 
-from scenefuse.core.stage import StageError, atomic_directory, write_json
-from scenefuse.photos.workspace import write_model
+from scenefuse.core.stage import StageError, atomic_directory, read_json, value, write_json
+from scenefuse.core.transforms import Array
+from scenefuse.photos.workspace import View, write_model
+from scenefuse.surface.gltf import earth_from_scene
 from scenefuse.surface.make_surface import SurfaceInputs, placed_views
 
 # Cameras of OpenGL and nerfstudio look along -z, with y up.
 OPENGL_FROM_OPENCV = np.diag([1.0, -1, -1, 1])
 
 
-def export_cameras(*, scene_workspace: Path | None = None, objects: list[Path], folder: Path) -> None:
-    """Write all cameras as a COLMAP model and as transforms.json (nerfstudio), of undistorted photos.
+def export_cameras(
+    *, scene_workspace: Path | None = None, objects: list[Path], georeference_json: Path | None = None, folder: Path
+) -> None:
+    """Write all cameras as a COLMAP model, as transforms.json (nerfstudio) and as cameras.xml (Metashape).
 
-    Photos are named by their paths: in the model from the folder of `objects/` and `scenes/`, in transforms.json from
-    its own. Objects without photos or without a place in the scene have no cameras there.
+    They are those of undistorted photos, named by their paths: in the model from the folder of `objects/` and
+    `scenes/`, in transforms.json from its own; in cameras.xml by their names alone. Objects without photos or without
+    a place in the scene have no cameras there.
 
     Args:
         scene_workspace: the scene's undistorted COLMAP workspace, where it has photos.
         objects: result folders of its objects.
+        georeference_json: JSON of the scene, for its place in the world.
         folder: output.
 
     Raises:
@@ -48,3 +56,40 @@ def export_cameras(*, scene_workspace: Path | None = None, objects: list[Path], 
     with atomic_directory(folder) as output:
         write_model(output, views)
         write_json(output / "transforms.json", {"camera_model": "PINHOLE", "frames": frames})
+        known = {} if georeference_json is None else read_json(georeference_json)
+        crs = value(known, "crs") if "crs" in known else None
+        document = _metashape(views, earth_from_scene(georeference_json), crs)
+        ET.ElementTree(document).write(output / "cameras.xml", encoding="utf-8", xml_declaration=True)
+
+
+def _metashape(views: list[View], earth_from_scene: Array | None, crs: str | None) -> ET.Element:
+    """What Metashape's "Import Cameras" reads: a sensor a camera, poses in the scene's frame, and that on the Earth."""
+    document = ET.Element("document", version="2.0.0")
+    chunk = ET.SubElement(document, "chunk", label="scenefuse", enabled="true")
+    sensors, cameras = ET.SubElement(chunk, "sensors"), ET.SubElement(chunk, "cameras")
+    for number, view in enumerate(views):
+        label, key = Path(view.name).stem, str(number)
+        size = {"width": str(view.width), "height": str(view.height)}
+        sensor = ET.SubElement(sensors, "sensor", id=key, label=label, type="frame")
+        ET.SubElement(sensor, "resolution", size)
+        calibration = ET.SubElement(sensor, "calibration", {"type": "frame", "class": "adjusted"})
+        ET.SubElement(calibration, "resolution", size)
+        k = view.intrinsics
+        lens = {"f": k[1, 1], "b1": k[0, 0] - k[1, 1], "cx": k[0, 2] - view.width / 2, "cy": k[1, 2] - view.height / 2}
+        for name, number_px in lens.items():
+            ET.SubElement(calibration, name).text = repr(float(number_px))
+        camera = ET.SubElement(cameras, "camera", id=key, sensor_id=key, label=label, enabled="true")
+        ET.SubElement(camera, "transform").text = _numbers(view.world_from_cam)
+    if earth_from_scene is not None and crs is not None:
+        scale = float(np.cbrt(np.linalg.det(earth_from_scene[:3, :3])))
+        transform = ET.SubElement(chunk, "transform")
+        ET.SubElement(transform, "rotation").text = _numbers(earth_from_scene[:3, :3] / scale)
+        ET.SubElement(transform, "translation").text = _numbers(earth_from_scene[:3, 3])
+        ET.SubElement(transform, "scale").text = repr(scale)
+        ET.SubElement(chunk, "reference").text = pyproj.CRS.from_user_input(crs).to_wkt("WKT1_GDAL")
+    return document
+
+
+def _numbers(values: Array) -> str:
+    """Numbers as XML holds them, row after row."""
+    return " ".join(repr(float(number)) for number in np.ravel(values))

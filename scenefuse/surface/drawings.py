@@ -1,18 +1,18 @@
 """Drawings of a surface to scale: from above in the CRS, and elevations along the object's own walls (method F9)."""
 
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyproj
+import rasterio
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
-from PIL import Image
-from PIL.TiffImagePlugin import ImageFileDirectory_v2
+from rasterio import Affine
+from rasterio.enums import ColorInterp
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
@@ -28,6 +28,7 @@ from scenefuse.surface.texture import MAX_SIDE_PX
 
 # Width and height of a page, A3, and of what is drawn on it at most, metres.
 PAGE, DRAWN = np.array([0.42, 0.297]), np.array([0.37, 0.247])
+COLORS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
 # Value of the class band where nothing is.
 NOTHING = 255
 # Axes of drawings, right and up, by the side that they are seen from; a drawing's third axis points at the viewer.
@@ -38,15 +39,6 @@ SIDES = {
     "north": ((-1, 0, 0), (0, 0, 1)),
     "west": ((0, -1, 0), (0, 0, 1)),
 }
-
-
-class Tag(IntEnum):
-    """GeoTIFF's tags, and GDAL's for the value of nothing."""
-
-    PIXEL_SCALE = 33550
-    TIE_POINT = 33922
-    GEO_KEYS = 34735
-    NO_DATA = 42113
 
 
 @dataclass(frozen=True)
@@ -201,30 +193,26 @@ def pixel_of(surface: Surface, painted: Painted | None) -> float:
 
 
 def _write_bands(path: Path, drawing: Drawing, crs: str | None, shift: Array) -> None:
-    """PATH.tif and its bands, the places of their pixels in their tags, and the CRS where there is one."""
+    """PATH.tif and its bands, cloud-optimised GeoTIFFs, in the CRS where there is one."""
+    height, width = drawing.classes.shape
+    plane = {
+        "transform": Affine(drawing.pixel, 0, drawing.left + shift[0], 0, -drawing.pixel, drawing.top + shift[1]),
+        "crs": None if crs is None else pyproj.CRS.from_user_input(crs).to_2d().to_wkt(),
+        "driver": "COG",
+        "compress": "deflate",
+        "overview_resampling": "nearest",
+    }
     for ending, band, nothing in (
-        ("", drawing.colors, None),
-        ("_height", drawing.heights + np.float32(shift[2]), "nan"),
-        ("_class", drawing.classes, str(NOTHING)),
-        ("_deviation", drawing.deviations, "nan"),
+        ("", np.moveaxis(drawing.colors, 2, 0), None),
+        ("_height", (drawing.heights + np.float32(shift[2]))[None], np.nan),
+        ("_class", drawing.classes[None], NOTHING),
+        ("_deviation", drawing.deviations[None], np.nan),
     ):
-        tags = ImageFileDirectory_v2()
-        tags[Tag.PIXEL_SCALE] = (drawing.pixel, drawing.pixel, 0.0)
-        tags[Tag.TIE_POINT] = (0.0, 0.0, 0.0, drawing.left + shift[0], drawing.top + shift[1], 0.0)
-        tags.tagtype |= {Tag.PIXEL_SCALE: 12, Tag.TIE_POINT: 12, Tag.GEO_KEYS: 3, Tag.NO_DATA: 2}
-        code = None if crs is None else _plane_code(crs)
-        if code:
-            tags[Tag.GEO_KEYS] = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, code)
-        if nothing:
-            tags[Tag.NO_DATA] = nothing
-        Image.fromarray(band).save(f"{path}{ending}.tif", tiffinfo=tags)
-
-
-def _plane_code(crs: str) -> int | None:
-    """The EPSG code of a CRS without its heights, where it has one and is projected."""
-    known = pyproj.CRS.from_user_input(crs)
-    known = known.sub_crs_list[0] if known.is_compound else known
-    return known.to_epsg() if known.is_projected else None
+        shape = {"count": len(band), "height": height, "width": width, "dtype": band.dtype, "nodata": nothing}
+        with rasterio.open(f"{path}{ending}.tif", "w", **shape, **plane) as file:
+            file.write(band)
+            if len(band) == 4:
+                file.colorinterp = COLORS
 
 
 def _scale(drawing: Drawing, metres: float) -> int:

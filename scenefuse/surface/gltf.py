@@ -12,14 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 from numpy.typing import NDArray
 from PIL import Image
 
+from scenefuse.cloud.clouds import Cloud
 from scenefuse.cloud.crs import LINEAR_UNITS
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.transforms import Array
 from scenefuse.core.version import VERSION
-from scenefuse.photos.geodesy import length_unit
+from scenefuse.photos.geodesy import length_unit, scene_frame
 from scenefuse.surface.mesh import FaceClass, Surface
 
 # (x, y, z) east, north, up to glTF's x east, y up, z south.
@@ -97,26 +99,49 @@ def write_glb(
         "pbrMetallicRoughness": {"baseColorFactor": [*_linear(np.array(BRIDGED_TINT)), 1.0]},
         **unlit,
     }
+    content: dict[str, Any] = {"materials": [colored, tinted]}
+    if picture is not None and uv is not None and primitives:
+        encoded = io.BytesIO()
+        Image.fromarray(picture).save(encoded, "JPEG", quality=90)
+        content["images"] = [{"bufferView": buffer.add(encoded.getvalue()), "mimeType": "image/jpeg"}]
+        content["textures"] = [{"source": 0}]
+        colored["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+    _write(path, buffer, primitives, extras, content)
+
+
+def write_points(path: Path, cloud: Cloud, extras: dict[str, Any]) -> None:
+    """Write points, z up and in metres, with their colours and, where they have it, their `source` as feature id."""
+    buffer = _Buffer()
+    attributes = _attributes(buffer, cloud.points, cloud.colors)
+    primitive: dict[str, Any] = {"mode": 0, "attributes": attributes, "material": 0}
+    if "source" in cloud.fields:
+        source = cloud.fields["source"].astype(np.float32)
+        attributes["_FEATURE_ID_0"] = buffer.accessor(source, "SCALAR", _Code.FLOAT)
+        ids = [{"featureCount": int(source.max()) + 1, "attribute": 0, "label": "source"}]
+        primitive["extensions"] = {"EXT_mesh_features": {"featureIds": ids}}
+    _write(path, buffer, [primitive], extras, {"materials": [{"extensions": {"KHR_materials_unlit": {}}}]})
+
+
+def _write(
+    path: Path, buffer: _Buffer, primitives: list[dict[str, Any]], extras: dict[str, Any], more: dict[str, Any]
+) -> None:
+    """Write a GLB of one mesh, or of none where it has no primitives."""
     content: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"scenefuse {VERSION}", "extras": extras},
         "scene": 0,
         "scenes": [{"nodes": [0]} if primitives else {}],
     }
     if primitives:
+        used = sorted({name for primitive in primitives for name in primitive.get("extensions", ())})
         content |= {
-            "extensionsUsed": ["EXT_mesh_features", "KHR_materials_unlit"],
+            "extensionsUsed": [*used, "KHR_materials_unlit"],
             "nodes": [{"mesh": 0}],
             "meshes": [{"primitives": primitives}],
-            "materials": [colored, tinted],
+            **more,
+            "bufferViews": buffer.views,
+            "accessors": buffer.accessors,
+            "buffers": [{"byteLength": buffer.length}],
         }
-        if picture is not None and uv is not None:
-            encoded = io.BytesIO()
-            Image.fromarray(picture).save(encoded, "JPEG", quality=90)
-            content["images"] = [{"bufferView": buffer.add(encoded.getvalue()), "mimeType": "image/jpeg"}]
-            content["textures"] = [{"source": 0}]
-            colored["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
-        content |= {"bufferViews": buffer.views, "accessors": buffer.accessors}
-        content["buffers"] = [{"byteLength": buffer.length}]
     text = json.dumps(content, allow_nan=False).encode()
     chunks = [(b"JSON", text + b" " * (-len(text) % 4))]
     chunks += [(b"BIN\0", b"".join(buffer.parts))] if primitives else []
@@ -177,30 +202,38 @@ def _primitive(buffer: _Buffer, part: Surface, kind: FaceClass, metres: float, u
         _, first, again = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         vertices, faces, places = vertices[faces.ravel()[first]], again.reshape(-1, 3), uv.reshape(-1, 2)[first]
     assert vertices.normals is not None
-    positions = (metres * vertices.points @ Y_UP_FROM_Z_UP.T).astype(np.float32)
     length = np.linalg.norm(vertices.normals, axis=1, keepdims=True)
     normals = np.where(length > 0, vertices.normals / np.maximum(length, 1e-12), [0, 0, 1]) @ Y_UP_FROM_Z_UP.T
-    bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
-    attributes = {
-        "POSITION": buffer.accessor(positions, "VEC3", _Code.FLOAT, **bounds),
+    colors = None if uv is not None or kind == FaceClass.BRIDGED else vertices.colors
+    attributes = _attributes(buffer, metres * vertices.points, colors) | {
         "NORMAL": buffer.accessor(normals.astype(np.float32), "VEC3", _Code.FLOAT),
-        "_FEATURE_ID_0": buffer.accessor(np.full(len(positions), kind, np.float32), "SCALAR", _Code.FLOAT),
+        "_FEATURE_ID_0": buffer.accessor(np.full(len(vertices), kind, np.float32), "SCALAR", _Code.FLOAT),
     }
     if uv is not None:
         attributes["TEXCOORD_0"] = buffer.accessor(places.astype(np.float32), "VEC2", _Code.FLOAT)
-    elif vertices.colors is not None and kind != FaceClass.BRIDGED:
-        linear = _linear(vertices.colors)
-        rgba = np.column_stack([np.rint(65535 * linear), np.full(len(linear), 65535)]).astype(np.uint16)
-        attributes["COLOR_0"] = buffer.accessor(rgba, "VEC4", _Code.UNSIGNED_SHORT, normalized=True)
     return {
         "attributes": attributes,
         "indices": buffer.accessor(faces.astype(np.uint32).ravel(), "SCALAR", _Code.UNSIGNED_INT),
         "material": int(kind == FaceClass.BRIDGED),
         "extensions": {
-            "EXT_mesh_features": {"featureIds": [{"featureCount": len(FaceClass), "attribute": 0, "label": "class"}]}
+            "EXT_mesh_features": {
+                "featureIds": [{"featureCount": len(FaceClass), "attribute": 0, "label": "face_class"}]
+            }
         },
         "extras": {"class": kind.name.lower()},
     }
+
+
+def _attributes(buffer: _Buffer, points: Array, colors: NDArray[np.uint8] | None) -> dict[str, int]:
+    """Positions, z up and in metres, and colours of sRGB where there are some."""
+    positions = (points @ Y_UP_FROM_Z_UP.T).astype(np.float32)
+    bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
+    attributes = {"POSITION": buffer.accessor(positions, "VEC3", _Code.FLOAT, **bounds)}
+    if colors is not None:
+        linear = _linear(colors)
+        rgba = np.column_stack([np.rint(65535 * linear), np.full(len(linear), 65535)]).astype(np.uint16)
+        attributes["COLOR_0"] = buffer.accessor(rgba, "VEC4", _Code.UNSIGNED_SHORT, normalized=True)
+    return attributes
 
 
 def _linear(colors: NDArray[Any]) -> Array:
@@ -224,3 +257,20 @@ def place_of_scene(georeference_json: Path | None) -> dict[str, Any]:
     }
     names = ("crs", "origin_in_crs", "crs_from_scene")
     return content | {name: value(known, name) for name in names if name in known}
+
+
+def earth_from_scene(georeference_json: Path | None) -> Array | None:
+    """(4, 4) from a scene's frame to Earth-centred coordinates (EPSG:4978, m), right at its origin; None without place.
+
+    Heights are taken as those above the ellipsoid.
+    """
+    frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
+    if frame is None or frame.crs is None:
+        return None
+    step = 100.0
+    latitude, longitude, height = frame.inverse(step * np.vstack([np.zeros(3), np.eye(3)])).T
+    geocentric = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    origin, *ends = np.column_stack(geocentric.transform(longitude, latitude, height))
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = (np.array(ends) - origin).T / step, origin
+    return matrix

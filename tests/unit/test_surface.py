@@ -8,9 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
+import rasterio
 import trimesh
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from scenefuse import command_line
@@ -18,11 +19,13 @@ from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3, look_at
 from scenefuse.fuse.measure import Evidence
+from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
 from scenefuse.photos.workspace import View, read_views, write_model
 from scenefuse.report import facts
 from scenefuse.report.facts import surface_facts
+from scenefuse.surface import tiles
 from scenefuse.surface.cameras import export_cameras
-from scenefuse.surface.drawings import NOTHING, SIDES, Tag, draw, draw_surface, wall_turn
+from scenefuse.surface.drawings import NOTHING, SIDES, draw, draw_surface, wall_turn
 from scenefuse.surface.gltf import Painted, write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
 from scenefuse.surface.mesh import FaceClass, make_mesh
@@ -30,6 +33,11 @@ from scenefuse.surface.texture import textured
 
 # Spacing of points on a sphere, and the radius of a gap in it that is narrow beside its diagonal.
 STEP, NARROW = 0.012, 0.032
+GEOREFERENCE = {
+    "crs": quantity("EPSG:25832", ""),
+    "origin_in_crs": quantity([500100.0, 5200200.0, 300.0], "m"),
+    "length_unit": quantity("m", ""),
+}
 TOP, ASIDE = np.array([0.0, 0, 1]), np.full(3, 3**-0.5)
 
 
@@ -219,18 +227,18 @@ def test_an_elevation_has_the_scale_that_it_says(closed, tmp_path: Path):
     draw_surface(name="ball", surface=tmp_path / "surface.ply", glb=tmp_path / "surface.glb", folder=tmp_path / "d")
     report = read_json(tmp_path / "d/drawings.json")
     for side in SIDES:
-        band = Image.open(tmp_path / f"d/{side}_class.tif")
+        band = rasterio.open(tmp_path / f"d/{side}_class.tif")
         pixel = value(report, f"{side}_pixel")
-        assert band.tag_v2[Tag.PIXEL_SCALE][:2] == pytest.approx((pixel, pixel))
-        shown = np.asarray(band) != NOTHING
+        assert band.res == pytest.approx((pixel, pixel)) and band.nodata == NOTHING
+        shown = band.read(1) != NOTHING
         assert [n * pixel for n in (shown.any(0).sum(), shown.any(1).sum())] == pytest.approx([2, 2], abs=3 * pixel)
         assert shown.sum() * pixel**2 == pytest.approx(np.pi, rel=0.01)
-        left, top = band.tag_v2[Tag.TIE_POINT][3:5]
+        left, top = band.bounds.left, band.bounds.top
         middle = np.argwhere(shown).mean(0) + 0.5
         assert [left + middle[1] * pixel, top - middle[0] * pixel] == pytest.approx([0, 0], abs=pixel)
-    assert np.nanmax(np.asarray(Image.open(tmp_path / "d/above_height.tif"))) == pytest.approx(1, abs=0.01)
+    assert np.nanmax(rasterio.open(tmp_path / "d/above_height.tif").read(1)) == pytest.approx(1, abs=0.01)
     # What photos do not confirm is below.
-    assert (np.asarray(Image.open(tmp_path / "d/above_class.tif")) != FaceClass.UNCONFIRMED).mean() > 0.97
+    assert (rasterio.open(tmp_path / "d/above_class.tif").read(1) != FaceClass.UNCONFIRMED).mean() > 0.97
     assert (tmp_path / "d/drawings.pdf").read_bytes()[:4] == b"%PDF"
 
 
@@ -248,19 +256,15 @@ def test_a_bridge_is_not_drawn_in_the_colours_of_what_lies_behind_it(closed):
 def test_a_drawing_from_above_lies_in_the_crs_of_its_scene(closed, tmp_path: Path):
     write_surface(tmp_path / "surface.ply", closed)
     write_glb(tmp_path / "surface.glb", closed, {})
-    georeference = {
-        "crs": quantity("EPSG:25832", ""),
-        "origin_in_crs": quantity([500100.0, 5200200.0, 300.0], "m"),
-        "length_unit": quantity("m", ""),
-    }
-    write_json(tmp_path / "g.json", georeference)
+    write_json(tmp_path / "g.json", GEOREFERENCE)
     files = {"surface": tmp_path / "surface.ply", "glb": tmp_path / "surface.glb", "folder": tmp_path / "d"}
     draw_surface(name="ball", georeference_json=tmp_path / "g.json", **files)
-    picture = Image.open(tmp_path / "d/above_height.tif")
-    assert picture.tag_v2[Tag.TIE_POINT][3:5] == pytest.approx((500099, 5200201), abs=0.1)
-    assert picture.tag_v2[Tag.GEO_KEYS][-1] == 25832
-    assert np.nanmax(np.asarray(picture)) == pytest.approx(301, abs=0.01)
-    assert np.isnan(picture.getpixel((0, 0)))
+    picture = rasterio.open(tmp_path / "d/above_height.tif")
+    assert picture.bounds[:1] + picture.bounds[3:] == pytest.approx((500099, 5200201), abs=0.1)
+    assert picture.crs.to_epsg() == 25832 and picture.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+    heights = picture.read(1)
+    assert np.nanmax(heights) == pytest.approx(301, abs=0.01)
+    assert np.isnan(heights[0, 0])
 
 
 def test_elevations_are_turned_to_the_walls():
@@ -295,6 +299,69 @@ def test_cameras_of_both_sides_are_exported_in_the_frame_of_the_scene(tmp_path: 
     assert matrix[2, 2] > 0.99
 
 
+def test_metashape_reads_the_cameras_and_their_place(tmp_path: Path):
+    workspace, folder = tmp_path / "scenes/yard/undistorted", tmp_path / "scenes/yard/cameras"
+    (workspace / "sparse").mkdir(parents=True)
+    write_model(workspace / "sparse", from_above(3))
+    write_json(tmp_path / "g.json", GEOREFERENCE)
+    export_cameras(scene_workspace=workspace, objects=[], georeference_json=tmp_path / "g.json", folder=folder)
+    found = {given.name: given for given in read_metashape(folder / "cameras.xml")}
+    for view in from_above(3):
+        assert np.allclose(found[Path(view.name).stem].object_from_cam, view.world_from_cam)
+        lens = found[Path(view.name).stem].camera
+        assert np.allclose(lens.calibration_matrix(), view.intrinsics)
+    place = metashape_place(folder / "cameras.xml")
+    assert place is not None and place.crs.to_epsg() == 25832
+    easting, northing, _ = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:25832").transform(
+        *place.earth_from_model.translation
+    )
+    assert (easting, northing) == pytest.approx((500100, 5200200), abs=0.01)
+
+
+def test_tiles_hold_every_point_once_and_lie_where_the_scene_lies(closed, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(tiles, "TILE_SIZE", 500)
+    rng = np.random.default_rng(0)
+    points = rng.uniform([0, 0, 0], [20, 10, 3], (3000, 3))
+    cloud = Cloud(
+        points, None, rng.integers(0, 255, points.shape).astype(np.uint8), {"source": np.ones(3000, np.uint8)}
+    )
+    write_cloud(tmp_path / "completed.ply", cloud)
+    (tmp_path / "ball").mkdir()
+    write_surface(tmp_path / "ball/surface.ply", closed)
+    write_glb(tmp_path / "ball/surface.glb", closed, {})
+    write_json(tmp_path / "g.json", GEOREFERENCE)
+    tiles.make_tiles(
+        cloud=tmp_path / "completed.ply", objects=[tmp_path / "ball"],
+        georeference_json=tmp_path / "g.json", folder=tmp_path / "tiles",
+    )  # fmt: skip
+    found = []
+
+    def walk(tile, folder, outer):
+        centre, half = np.array(tile["boundingVolume"]["box"])[:3], np.array(tile["boundingVolume"]["box"])[[3, 7, 11]]
+        assert tile["geometricError"] < outer
+        if "content" in tile:
+            scene = trimesh.load(folder / tile["content"]["uri"])
+            # Viewers turn y up to z up.
+            inside = np.asarray(scene.to_geometry().vertices) @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+            assert (np.abs(inside - centre) <= half + 1e-4).all()
+            found.append((tile["content"]["uri"], inside))
+        for child in tile.get("children", ()):
+            walk(child, folder, tile["geometricError"])
+
+    for name in ("points", "surfaces"):
+        content = read_json(tmp_path / f"tiles/{name}/tileset.json")
+        assert content["asset"]["version"] == "1.1"
+        walk(content["root"], tmp_path / "tiles" / name, np.inf)
+        earth = np.array(content["root"]["transform"]).reshape(4, 4).T
+        top = earth @ [20, 10, 3, 1]
+        easting, northing, _ = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:25832").transform(*top[:3])
+        assert (easting, northing) == pytest.approx((500120, 5200210), abs=0.01)
+    every = np.concatenate([part for uri, part in found if uri.startswith("r")])
+    assert np.allclose(every[np.lexsort(every.T)], points[np.lexsort(points.astype(np.float32).T)], atol=1e-5)
+    counts = [len(part) for uri, part in found if uri.startswith("ball")]
+    assert len(counts) == 2 and 1000 < counts[0] < 10_000 and counts[1] >= len(closed.vertices)
+
+
 def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["scenefuse", "export"])
@@ -310,8 +377,8 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
     monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit) as ended:
         command_line.main()
-    # No side has photos, so there are no cameras.
-    assert ended.value.code == 0 and not any("cameras" in word for word in runs[0][:6])
+    # No side has photos, and the scene is not completed.
+    assert ended.value.code == 0 and not any("cameras" in word or "tiles" in word for word in runs[0][:6])
     assert {"results/objects/shed/surface.glb", "results/objects/shed/drawings", "2"} <= set(runs[0])
     assert "results/summary/report.html" in runs[1]
     # Nothing was left to do: a run that makes the page prints the closing lines itself.

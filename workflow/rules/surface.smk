@@ -2,7 +2,17 @@
 #
 # INPUTS    results/objects/{object}/fused.ply, fusion.json, undistorted/; results/scenes/{scene}/undistorted/, georeference.json
 # OUTPUTS   results/objects/{object}/surface.ply, surface.glb, surface.json, drawings/
-#           results/scenes/{scene}/cameras/
+#           results/scenes/{scene}/cameras/, tiles/
+
+
+def finished_in(path):
+    """Input function: a file or folder of every object of the scene that is fused; those that failed are left out."""
+    return lambda wildcards: [
+        f"results/objects/{name}/{path}"
+        for name in objects_in(wildcards)
+        if Path(f"results/objects/{name}/fused.ply").is_file()
+        and not (path == "undistorted" and not OBJECTS[name].get("photos"))
+    ]
 
 
 rule make_surface:
@@ -67,19 +77,16 @@ rule draw_surface:
 
 
 rule export_cameras:
-    """The cameras of a scene and of its objects in one frame: a COLMAP model and transforms.json."""
+    """The cameras of a scene and of its objects in one frame, for COLMAP, nerfstudio and Metashape."""
     input:
         scene_workspace=lambda wildcards: (
             [f"results/scenes/{wildcards.scene}/undistorted"]
             if scene_row(wildcards.scene).get("photos")
             else []
         ),
-        fusions=of_objects("fusion.json"),
-        workspaces=lambda wildcards: [
-            f"results/objects/{name}/undistorted"
-            for name in objects_in(wildcards)
-            if OBJECTS[name].get("photos")
-        ],
+        fusions=finished_in("fusion.json"),
+        workspaces=finished_in("undistorted"),
+        georeference="results/scenes/{scene}/georeference.json",
     output:
         directory("results/scenes/{scene}/cameras"),
     log:
@@ -92,11 +99,41 @@ rule export_cameras:
         mem_mb=2000,
         runtime=lambda wildcards, attempt: 10 * attempt,
     params:
-        objects=object_folders,
+        objects=lambda wildcards: [path.rstrip("/") for path in finished_in("")(wildcards)],
         photos=options_of("scene_workspace"),
         script=script("surface/export_cameras.py"),
         code=code("surface/export_cameras.py"),
     message:
         "Scene {wildcards.scene}: cameras of both sides"
     shell:
-        "exec python {params.script} {params.photos} --objects {params.objects} --folder {output} &> {log}"
+        "exec python {params.script} {params.photos} --objects {params.objects}"
+        " --georeference-json {input.georeference} --folder {output} &> {log}"
+
+
+rule make_tiles:
+    """3D Tiles for web viewers: the completed scene's points, and the surfaces of its objects."""
+    input:
+        cloud="results/scenes/{scene}/completed.ply",
+        surfaces=finished_in("surface.ply"),
+        glbs=finished_in("surface.glb"),
+        georeference="results/scenes/{scene}/georeference.json",
+    output:
+        directory("results/scenes/{scene}/tiles"),
+    log:
+        "results/logs/make_tiles/{scene}.log",
+    benchmark:
+        "results/benchmarks/make_tiles/{scene}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    resources:
+        mem_mb=by_size(2000, cloud=10),
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        objects=lambda wildcards: [path.rstrip("/") for path in finished_in("")(wildcards)],
+        script=script("surface/make_tiles.py"),
+        code=code("surface/make_tiles.py"),
+    message:
+        "Scene {wildcards.scene}: 3D Tiles"
+    shell:
+        "exec python {params.script} --cloud {input.cloud} --objects {params.objects}"
+        " --georeference-json {input.georeference} --folder {output} &> {log}"
