@@ -99,7 +99,9 @@ rule export_cameras:
         mem_mb=2000,
         runtime=lambda wildcards, attempt: 10 * attempt,
     params:
-        objects=lambda wildcards: [path.rstrip("/") for path in finished_in("")(wildcards)],
+        objects=lambda wildcards: [
+            path.rstrip("/") for path in finished_in("")(wildcards)
+        ],
         photos=options_of("scene_workspace"),
         script=script("surface/export_cameras.py"),
         code=code("surface/export_cameras.py"),
@@ -129,7 +131,9 @@ rule make_tiles:
         mem_mb=by_size(2000, cloud=10),
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
-        objects=lambda wildcards: [path.rstrip("/") for path in finished_in("")(wildcards)],
+        objects=lambda wildcards: [
+            path.rstrip("/") for path in finished_in("")(wildcards)
+        ],
         script=script("surface/make_tiles.py"),
         code=code("surface/make_tiles.py"),
     message:
