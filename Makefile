@@ -1,9 +1,9 @@
-# make demo | check | test | test-faults | lint | report | bench | docs | clean      (CORES=2 by default, PYTHON=python3)
+# make demo | check | check-gpu | test | test-faults | lint | report | bench | docs | clean      (CORES=2 by default, PYTHON=python3)
 CORES ?= 2
 PYTHON ?= python3
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: demo check test test-faults lint report bench bench-registration bench-nerf bench-scale fuzz mutants audit docs clean
+.PHONY: demo check check-gpu test test-faults lint report bench bench-registration bench-nerf bench-scale fuzz mutants audit docs clean
 
 demo: .venv/ready
 	snakemake --configfile config/demo.yaml --cores $(CORES)
@@ -12,6 +12,10 @@ demo: .venv/ready
 # Unit tests that start no process; those of one package and what imports it: make check PART=masks.
 check: .venv/tests
 	pytest -n $(CORES) --dist loadfile -m "not process" $(if $(PART),--part $(PART)) tests/unit
+
+# Every path that a GPU takes beside its twin on the CPU, on a machine with PyTorch's CUDA build where nothing is installed.
+check-gpu:
+	PYTHONPATH=.:tests $(PYTHON) tests/benchmarks/gpu.py --table gpu.tsv
 
 # All tests: those of whole workflows first.
 test: .venv/tests
