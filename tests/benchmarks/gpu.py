@@ -4,7 +4,7 @@ make check-gpu, or, on a machine with PyTorch, Triton and a GPU where nothing is
 PYTHONPATH=.:tests python3 tests/benchmarks/gpu.py --table gpu.tsv --object results/objects/house --lego data/lego
 
 Beside PyTorch and Triton it needs NumPy, SciPy, Numba, OpenCV, PyYAML, jsonschema and tyro; pycolmap (pycolmap-cuda12
-for patch-match, with X11's libraries) and pyproj for an object's photos, transformers for SAM 2. Without a GPU both sides
+for patch-match, with X11's libraries) and pyproj for photos, transformers for SAM 2. Without a GPU both sides
 run on the CPU, which checks the checks.
 """
 
