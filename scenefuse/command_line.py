@@ -97,7 +97,7 @@ def _export() -> None:
     """make what is handed over of finished objects: surfaces, drawings, cameras"""
     parser = argparse.ArgumentParser(
         prog="scenefuse export",
-        description="Make surfaces, drawings, cameras and 3D Tiles of finished objects, and show them in the report."
+        description="Make surfaces, drawings, cameras, 3D Tiles and a PDF of finished objects, and show them in the report."
         " Nothing before them runs again.",
         epilog="All other options are those of scenefuse run, as -n to see what would be made.",
     )
@@ -112,11 +112,11 @@ def _export() -> None:
     names = sorted(words.names or finished)
     scenes = sorted(path.parent.name for path in Path().glob("results/scenes/*/dense.ply"))
     # Given clouds have no cameras, and a scene that was not completed has no tiles.
-    needed = {"cameras": "results/*/*/undistorted", "tiles": "results/scenes/*/completed.ply"}
+    needed = {"cameras": "results/*/*/undistorted", "tiles": "results/scenes/*/completed.ply", "pdf": str(REPORT)}
     what = [item for item in words.what if any(Path().glob(needed.get(item, "*")))]
     targets = {EXPORTS[item].format(object=name, scene=scene) for item in what for name in names for scene in scenes}
     run = [sys.executable, "-m", "scenefuse", "run"]
-    rules = ["make_surface", "draw_surface", "export_cameras", "make_tiles"]
+    rules = ["make_surface", "draw_surface", "export_cameras", "make_tiles", "write_pdf"]
     ended = subprocess.run([*run, *sorted(targets), *others, "--allowed-rules", *rules]).returncode
     if ended or {"-n", "--dry-run", "--dryrun"} & set(others):
         sys.exit(ended)
@@ -192,6 +192,7 @@ EXPORTS = {
     "drawings": "results/objects/{object}/drawings",
     "cameras": "results/scenes/{scene}/cameras",
     "tiles": "results/scenes/{scene}/tiles",
+    "pdf": "results/summary/report.pdf",
 }
 PARTS: dict[str, Callable[[], None]] = {
     "complete": _complete,

@@ -8,10 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pypdfium2
 import pyproj
 import pytest
 import rasterio
 import trimesh
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from scenefuse import command_line
@@ -23,6 +25,7 @@ from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
 from scenefuse.photos.workspace import View, read_views, write_model
 from scenefuse.report import facts
 from scenefuse.report.facts import surface_facts
+from scenefuse.report.write_pdf import write_pdf
 from scenefuse.surface import tiles
 from scenefuse.surface.cameras import export_cameras
 from scenefuse.surface.drawings import NOTHING, SIDES, draw, draw_surface, wall_turn
@@ -382,7 +385,7 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
     assert {"results/objects/shed/surface.glb", "results/objects/shed/drawings", "2"} <= set(runs[0])
     assert "results/summary/report.html" in runs[1]
     # Nothing was left to do: a run that makes the page prints the closing lines itself.
-    exported = "Export: results/objects/shed/surface.glb, results/objects/shed/drawings\n"
+    exported = "Export: results/objects/shed/surface.glb, results/objects/shed/drawings, results/summary/report.pdf\n"
     assert capsys.readouterr().out == f"{exported}Result: 1; results/summary\n"
     made, page = iter([(1, 1), (2, 2)]), "results/summary/report.html"
     monkeypatch.setattr(subprocess, "run", lambda words, **_: os.utime(page, next(made)) or done)
@@ -398,3 +401,36 @@ def test_the_report_says_of_a_surface_how_much_is_measured(closed, tmp_path: Pat
     write_json(tmp_path / "surface.json", surface_report(closed, "m") | {"reason": quantity("", "")})
     found = surface_facts(tmp_path)["Mesh"]
     assert "% measured" in found and "% open" in found and found.endswith(f"objects/{tmp_path.name}/surface.glb")
+
+
+def test_an_object_has_two_pages_on_paper_with_its_sides_to_one_scale(closed, tmp_path: Path):
+    shed, summary = tmp_path / "objects/shed", tmp_path / "summary"
+    (shed / "figures").mkdir(parents=True)
+    summary.mkdir()
+    write_surface(tmp_path / "surface.ply", closed)
+    write_glb(tmp_path / "surface.glb", closed, {})
+    files = {"surface": tmp_path / "surface.ply", "glb": tmp_path / "surface.glb"}
+    draw_surface(name="shed", folder=shed / "drawings", **files)
+    for name in ("before", "after", "missing"):
+        Image.new("RGB", (400, 300)).save(shed / f"figures/{name}.png")
+    table = {"object": "shed", "status": "registered", "length": 11.4, "width": 10, "height": 8.1, "unit": "m"}
+    (summary / "objects.tsv").write_text("\t".join(table) + "\n" + "\t".join(map(str, table.values())) + "\n")
+    (summary / "scenes.tsv").write_text("scene\tcrs\tlength_unit\nyard\tEPSG:25832\tm\n")
+    write_pdf(
+        summary=summary,
+        scenes=(tmp_path / "scenes/yard",),
+        objects=(shed,),
+        title="Hof Müller",
+        report=tmp_path / "r.pdf",
+    )
+    pages = [page.get_textpage().get_text_bounded() for page in pypdfium2.PdfDocument(tmp_path / "r.pdf")]
+    assert len(pages) == 2
+    for word in ("Hof Müller", "11.4 m × 10.0 m, 8.10 m high", "ETRS89 / UTM zone 32N (EPSG:25832)"):
+        assert word in pages[0]
+    assert "from the north" in pages[1] and "1.00 scene units" in pages[1]
+
+
+def test_a_report_on_paper_of_what_failed_says_so(tmp_path: Path):
+    (tmp_path / "objects.tsv").write_text("object\tstatus\terror\nshed\tfailed\ttoo little overlap\n")
+    write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")
+    assert "oo little overlap" in pypdfium2.PdfDocument(tmp_path / "r.pdf")[0].get_textpage().get_text_bounded()

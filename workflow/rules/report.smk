@@ -238,6 +238,38 @@ rule write_report:
         " --report {output} &> {log}"
 
 
+rule write_pdf:
+    """The same on paper, two pages an object; `scenefuse export` asks for it."""
+    input:
+        summary="results/summary/summary.txt",
+        scenes=expand("results/scenes/{scene}/scene.png", scene=SCENES),
+        figures=expand("results/objects/{object}/figures", object=OBJECTS),
+        drawings=[
+            f"results/objects/{name}/drawings"
+            for name in OBJECTS
+            if Path(f"results/objects/{name}/fused.ply").is_file()
+        ],
+    output:
+        "results/summary/report.pdf",
+    log:
+        "results/logs/write_pdf/all.log",
+    benchmark:
+        "results/benchmarks/write_pdf/all.tsv"
+    conda:
+        "../../envs/report.yaml"
+    resources:
+        mem_mb=2000,
+        runtime=10,
+    params:
+        folders=result_folders,
+        script=script("report/write_pdf.py"),
+        code=code("report/write_pdf.py"),
+    message:
+        "Summary: report on paper"
+    shell:
+        "exec python {params.script} --summary results/summary {params.folders} --report {output} &> {log}"
+
+
 onstart:
     hold_run_lock()
     for line in forecast_run():

@@ -1,0 +1,159 @@
+"""The report on paper: two A4 pages an object, of the records that the page is made of."""
+
+import logging
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import rasterio
+from fpdf import FPDF
+from PIL import Image
+
+from scenefuse.core.stage import atomic_file, read_json, value
+from scenefuse.core.version import VERSION
+from scenefuse.report.facts import object_facts, scene_facts, surface_facts
+from scenefuse.report.tables import records
+from scenefuse.report.values import length, read_table
+
+MARGIN_MM, GAP_MM = 15, 4
+SIDES = ("south", "east", "north", "west")
+
+
+def write_pdf(
+    *, summary: Path, scenes: tuple[Path, ...] = (), objects: tuple[Path, ...] = (), title: str = "", report: Path
+) -> None:
+    """Write what a client keeps: an object's facts and pictures, its four sides to one scale, its scene.
+
+    Args:
+        summary: folder with the summary's TSV files.
+        scenes: result folders of the scenes.
+        objects: result folders of the objects; drawings/ and figures/ in them are shown where they are.
+        title: of the project; the working directory's name where it is left out.
+        report: output PDF.
+    """
+    of_object, of_scene = (
+        {row[kind]: row for row in records(read_table(summary / f"{kind}s.tsv"))} for kind in ("object", "scene")
+    )
+    page = _Page(title or Path.cwd().name)
+    for folder in objects:
+        name = folder.name
+        page.start(name, f"{page.project}, {date.fromtimestamp((summary / 'objects.tsv').stat().st_mtime)}")
+        page.facts(object_facts(of_object.get(name, {"object": name, "status": "missing"})) | surface_facts(folder))
+        page.pictures([folder / f"figures/{when}.png" for when in ("before", "after")], ["before", "after"])
+        own = [path for path in scenes if len(scenes) == 1 or name in _completed_by(of_scene.get(path.name, {}))]
+        for path in own:
+            if path.name in of_scene:
+                page.heading(f"Scene {path.name}")
+                page.facts(scene_facts(of_scene[path.name]))
+            page.pictures([path / "scene.png"], ["the scene, its cameras and their errors"])
+        page.start(name, "from four sides, to one scale")
+        if (folder / "drawings/drawings.json").is_file():
+            page.sides(folder / "drawings")
+        page.pictures([folder / "figures/missing.png"], ["what is missing, and from where photos would show it"])
+    with atomic_file(report) as temporary:
+        page.output(str(temporary))
+
+
+def _completed_by(row: dict[str, Any]) -> list[str]:
+    """The objects that a scene was completed with."""
+    return str(row.get("completed_by", "")).split(", ")
+
+
+class _Page(FPDF):
+    """A4 pages that begin with the project and end with who made them."""
+
+    def __init__(self, project: str) -> None:
+        super().__init__()
+        logging.getLogger("fpdf").setLevel(logging.ERROR)
+        logging.getLogger("fontTools").setLevel(logging.ERROR)
+        fonts = Path(matplotlib.get_data_path()) / "fonts/ttf"
+        self.add_font("sans", "", fonts / "DejaVuSans.ttf")
+        self.add_font("sans", "B", fonts / "DejaVuSans-Bold.ttf")
+        self.project = project
+        self.set_margin(MARGIN_MM)
+        self.set_title(project)
+        self.set_creator(f"scenefuse {VERSION}")
+
+    def footer(self) -> None:
+        """The project, the version and the number of the page."""
+        self.set_y(-MARGIN_MM)
+        self.set_font("sans", size=7)
+        self.cell(0, 4, f"{self.project}, made by scenefuse {VERSION}", align="L")
+        self.cell(0, 4, f"{self.page_no()}", align="R")
+
+    def start(self, name: str, below: str) -> None:
+        """A new page of an object, and a line below its name."""
+        self.add_page()
+        self.set_font("sans", "B", 16)
+        self.cell(0, 9, name, new_x="LMARGIN", new_y="NEXT")
+        self.set_font("sans", size=9)
+        self.cell(0, 6, below, new_x="LMARGIN", new_y="NEXT")
+        self.ln(GAP_MM)
+
+    def heading(self, text: str) -> None:
+        """A line above what follows."""
+        self.ln(GAP_MM)
+        self.set_font("sans", "B", 11)
+        self.cell(0, 6, text, new_x="LMARGIN", new_y="NEXT")
+
+    def facts(self, facts: dict[str, str]) -> None:
+        """A table of labels and sentences."""
+        self.set_font("sans", size=9)
+        self.set_line_width(0.1)
+        with self.table(
+            first_row_as_headings=False,
+            borders_layout="HORIZONTAL_LINES",
+            col_widths=(1, 5),
+            text_align="LEFT",
+            line_height=4.5,
+        ) as table:
+            for label, text in facts.items():
+                table.row([label, text])
+        self.ln(GAP_MM)
+
+    def pictures(self, paths: list[Path], captions: list[str]) -> None:
+        """The pictures that there are, beside each other, as large as the page allows."""
+        shown = [(path, caption) for path, caption in zip(paths, captions) if path.is_file()]
+        if not shown:
+            return
+        sizes = [Image.open(path).size for path, _ in shown]
+        width = (self.epw - GAP_MM * (len(shown) - 1)) / len(shown)
+        highest = width * max(h / w for w, h in sizes)
+        left = self.eph + self.t_margin - self.get_y() - 2 * GAP_MM
+        if left < highest / 4:
+            self.add_page()
+            left = self.eph - 2 * GAP_MM
+        width *= min(1.0, left / highest)
+        top = self.get_y()
+        self.set_font("sans", size=8)
+        for k, (path, caption) in enumerate(shown):
+            x = self.l_margin + k * (width + GAP_MM)
+            self.image(str(path), x, top, width)
+            self.text(x, top + min(left, highest) + 3, caption)
+        self.set_y(top + min(left, highest) + 2 * GAP_MM)
+
+    def sides(self, drawings: Path) -> None:
+        """The four elevations to one scale, with a bar that says it."""
+        known = read_json(drawings / "drawings.json")
+        unit, views = known["south_pixel"]["unit"], []
+        for side in SIDES:
+            with rasterio.open(drawings / f"{side}.tif") as file:
+                views.append((np.moveaxis(file.read(), 0, 2), value(known, f"{side}_pixel")))
+        width, height = (max(v.shape[axis] * pixel for v, pixel in views) for axis in (1, 0))
+        cell = (self.epw - GAP_MM) / 2
+        scale = min(cell / width, 0.2 * self.eph / height)
+        top = self.get_y()
+        self.set_font("sans", size=8)
+        for k, (side, (pixels, pixel)) in enumerate(zip(SIDES, views)):
+            x = self.l_margin + k % 2 * (cell + GAP_MM)
+            y = top + k // 2 * (height * scale + 2 * GAP_MM)
+            self.image(Image.fromarray(pixels), x, y, pixels.shape[1] * pixel * scale)
+            self.text(x, y + height * scale + 3, f"from the {side}")
+        bar = 10.0 ** np.floor(np.log10(width / 2))
+        self.set_y(top + 2 * (height * scale + 2 * GAP_MM) + 2)
+        self.set_line_width(1)
+        self.line(self.l_margin, self.get_y(), self.l_margin + bar * scale, self.get_y())
+        self.ln(1)
+        self.cell(0, 5, f"{length(bar, unit)}; white: not measured", new_x="LMARGIN", new_y="NEXT")
