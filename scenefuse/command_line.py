@@ -97,7 +97,7 @@ def _export() -> None:
     """make what is handed over of finished objects: surfaces, drawings, cameras"""
     parser = argparse.ArgumentParser(
         prog="scenefuse export",
-        description="Make surfaces, drawings, cameras, tiles and a PDF of finished objects, and show them in the report."
+        description="Make surfaces, drawings, cameras, tiles and a PDF of finished objects, shown in the report."
         " Nothing before them runs again.",
         epilog="All other options are those of scenefuse run, as -n to see what would be made.",
     )
