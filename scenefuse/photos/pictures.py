@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.core.stage import StageError, own_sigterm
+from scenefuse.core.stage import StageError
 from scenefuse.photos.photo_files import stored_size
 
 # Loses nothing that SIFT or a mask would notice.
@@ -81,13 +81,14 @@ def _read(path: Path, flags: int) -> NDArray[Any]:
 
 def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
     """Write an (H, W) float32 map of depths along the camera's z axis; 0 marks pixels without a depth."""
-    with own_sigterm():
-        import pycolmap
+    _write_map(path, depth[None])
 
-    valid = depth[depth > 0]
-    low, high = (float(valid.min()), float(valid.max())) if valid.size else (0.0, 0.0)
+
+def _write_map(path: Path, planes: NDArray[np.float32]) -> None:
+    """Write (C, H, W) as COLMAP does, which itself says nothing where the disk is full."""
+    count, height, width = planes.shape
     path.parent.mkdir(parents=True, exist_ok=True)
-    pycolmap.DepthMap.from_array(np.ascontiguousarray(depth, dtype=np.float32), low, high).write(path)
+    path.write_bytes(f"{width}&{height}&{count}&".encode() + np.ascontiguousarray(planes, dtype="<f4").tobytes())
 
 
 def read_depth(path: Path) -> NDArray[np.float32]:
@@ -101,10 +102,7 @@ def write_normals(path: Path, normals: NDArray[np.float32]) -> None:
     COLMAP's files hold all x, then all y, then all z. pycolmap.NormalMap (4.2) takes and gives arrays in the order of
     the file, which mixes the three up, so it is not used here.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    height, width, _ = normals.shape
-    planes = np.ascontiguousarray(np.moveaxis(normals, 2, 0), dtype="<f4")
-    path.write_bytes(f"{width}&{height}&3&".encode() + planes.tobytes())
+    _write_map(path, np.moveaxis(normals, 2, 0))
 
 
 def read_normals(path: Path) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ import scenefuse.photos.photo_files
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.photos.photo_files import photo_files, stored_size, upright_size
 from scenefuse.photos.photos import check_unchanged, inspect_photo, list_photos, read_photos
-from scenefuse.photos.pictures import read_gray, read_raw, write_picture
+from scenefuse.photos.pictures import read_gray, read_raw, write_depth, write_picture
 from scenefuse.photos.positions import stated_position
 
 
@@ -303,13 +303,13 @@ def test_a_picture_that_claims_a_billion_pixels_is_refused_before_it_is_decoded(
             read(tmp_path / "p" / "bomb.png")
 
 
-@pytest.mark.parametrize("ending", ["png", "jpg"])
-def test_a_picture_that_does_not_fit_on_the_disk_is_an_error(tmp_path, ending):
-    # OpenCV leaves a file of which the end is missing, and says nothing.
+@pytest.mark.parametrize(("write", "ending"), [(write_picture, "png"), (write_picture, "jpg"), (write_depth, "bin")])
+def test_a_picture_or_map_that_does_not_fit_on_the_disk_is_an_error(tmp_path, write, ending):
+    # OpenCV and COLMAP leave a file of which the end is missing, and say nothing.
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (40, limits[1]))
     try:
         with pytest.raises(OSError, match="too large"):
-            write_picture(tmp_path / f"a.{ending}", np.zeros((8, 8), dtype=np.uint8))
+            write(tmp_path / f"a.{ending}", np.zeros((8, 8), dtype=np.uint8))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
