@@ -1,7 +1,7 @@
 """Masks of all photos from a few clicks in one: the sparse points inside and outside its mask prompt the next photo."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -178,16 +178,16 @@ def _make(
     measure: Measure = agreement,
 ) -> tuple[Voter, list[str]]:
     """A photo's mask from its clicks and the others' votes; and the clicks left out as they contradict it."""
-    known = known_pixels(photos, k, others)
-    keep, view = np.ones(len(clicks.pixels), dtype=bool), photos.views[k]
-    notes: list[str] = []
+    known, view = known_pixels(photos, k, others), photos.views[k]
+    clicks, notes = _without_the_harmful(segment, view, known, clicks, tolerance_px, measure)
+    keep = np.ones(len(clicks.pixels), dtype=bool)
     voter = voter_of(photos, k, np.zeros((view.height, view.width), dtype=bool), 0.0, 0.0, NO_CLICKS)
     for _ in range(2):
         kept = clicks.only(keep)
         if len(known.known) < MIN_KNOWN_POINTS and not kept.prompt:
             break
-        prompts = known._replace(clicked=kept.on, clicked_off=np.concatenate([kept.off, known.clicked_off]))
-        voter = voter_of(photos, k, *best_mask(segment, view, prompts, clicks.box, tolerance_px, measure), kept)
+        made = best_mask(segment, view, _prompts(known, kept), kept.box, tolerance_px, measure)
+        voter = voter_of(photos, k, *made, kept)
         wrong = keep & ~_held_clicks(voter.mask, clicks, tolerance_px)
         if not wrong.any():
             break
@@ -199,6 +199,42 @@ def _make(
         ]
         keep &= ~wrong
     return voter, notes
+
+
+def _prompts(known: Prompts, clicks: PhotoClicks) -> Prompts:
+    return known._replace(clicked=clicks.on, clicked_off=np.concatenate([clicks.off, known.clicked_off]))
+
+
+def _without_the_harmful(
+    segment: Segmenter, view: View, known: Prompts, clicks: PhotoClicks, tolerance_px: float, measure: Measure
+) -> tuple[PhotoClicks, list[str]]:
+    """The clicks of a photo without a box or a last click that makes its mask worse, and a sentence on that.
+
+    The others are enough without it, and their mask agrees with more of all clicks; or, without a box, with as many,
+    and SAM 2 thinks more of it.
+    """
+    last = len(clicks.pixels) - 1
+    tries = {"": clicks, "the box": replace(clicks, box=None)}
+    if last >= 0:
+        tries[clicks.named(last)] = clicks.only(np.arange(last + 1) < last)
+    tries = {
+        what: some for what, some in tries.items() if some.enough and (what != "the box" or clicks.box is not None)
+    }
+    ranks: dict[str, tuple[float, float]] = {}
+    for what, some in tries.items() if len(tries) > 1 else ():
+        mask, quality, _ = best_mask(segment, view, _prompts(known, some), some.box, tolerance_px, measure)
+        share = agreement(mask, Prompts(clicks.on, clicks.off), tolerance_px)
+        # Fewer clicks prompt a mask that is surer of less.
+        ranks[what] = share, quality if what in ("", "the box") else ranks[""][1]
+    best = max(ranks, key=lambda what: ranks[what], default="")
+    if not best:
+        return clicks, []
+    (share, quality), (share_now, quality_now) = ranks[best], ranks[""]
+    note = (
+        f"{best} in {view.name}: without it the mask agrees with {share:.2f} of the clicks, at a quality of"
+        f" {quality:.2f}; with it {share_now:.2f}, at {quality_now:.2f}"
+    )
+    return tries[best], [note]
 
 
 def _held_clicks(mask: Mask, clicks: PhotoClicks, tolerance_px: float) -> NDArray[np.bool_]:

@@ -4,7 +4,6 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -156,58 +155,37 @@ class Segmenter:
         Raises:
             StageError: the photo cannot be read.
         """
+        from scenefuse.masks.prompts import Prompts, agreement
+        from scenefuse.masks.propagation import one_photo
         from scenefuse.masks.votes import MIN_AGREEMENT
+        from scenefuse.photos.workspace import View
 
         self.load()
         self._waiting += 1
         self._asked_at = time.monotonic()
         try:
             with self._busy:
+                assert self._ask is not None
                 pixels = self._pixels(picture)
                 height, width = pixels.shape[:2]
                 clicks = _clicks_of(picture, rows, width, height)
                 # As the workflow has it, in the undistorted photo.
                 size = min(self._photo_px, max(picture.width, picture.height))
                 tolerance_px = self._settings["max_click_residual_px"] * max(height, width) / size
-                mask, agreement, left_out = self._query(picture.name, pixels, clicks, clicks, tolerance_px)
-                fewer = {"the box": replace(clicks, box=None)} if clicks.box is not None else {}
-                fewer["the last click"] = clicks.only(np.arange(len(clicks.pixels)) < len(clicks.pixels) - 1)
-                better = {
-                    what: found[1]
-                    for what, kept in fewer.items()
-                    if (agreement < 1 or left_out) and kept.prompt
-                    if (found := self._query(picture.name, pixels, kept, clicks, tolerance_px))[1] > agreement
-                }
+                view = View(picture.name, np.eye(3), np.eye(4), width, height, pixels)
+                mask, _, _, left_out = one_photo(self._ask, view, clicks, tolerance_px)
         finally:
             self._waiting -= 1
-        notes = [
-            f"without {what} it agrees with more of the clicks ({share:.2f}, now {agreement:.2f}): take it back (z)"
-            for what, share in better.items()
-        ]
+        notes = [f"left out: {note}" for note in left_out]
         known = corners(pixels) if shared is None else shared * [width / picture.width, height / picture.height]
         if lies_in_nothing(mask, clicks.on, known):
             notes.append("a click lies where other photos can share nothing, as in the sky: click on the object")
         if self.method == "GrabCut" and clicks.box is None and clicks.inside.all():
             notes.append("GrabCut separates colours: click beside the object too, or drag a box around it")
-        if left_out:
-            clicks_lie = "click lies" if len(left_out) == 1 else "clicks lie"
-            notes.append(f"{len(left_out)} {clicks_lie} on the wrong side of its outline and would be left out")
-        if agreement < MIN_AGREEMENT:
-            notes.append(f"it agrees with {agreement:.2f} of the clicks, at least {MIN_AGREEMENT} is needed")
+        share = agreement(mask, Prompts(clicks.on, clicks.off), tolerance_px)
+        if share < MIN_AGREEMENT:
+            notes.append(f"it agrees with {share:.2f} of the clicks, at least {MIN_AGREEMENT} is needed")
         return mask, notes
-
-    def _query(
-        self, name: str, pixels: NDArray[np.uint8], clicks: "PhotoClicks", every: "PhotoClicks", tolerance_px: float
-    ) -> tuple[Mask, float, list[str]]:
-        """The mask from some clicks, how it agrees with all of them, and those of the some that it leaves out."""
-        from scenefuse.masks.prompts import Prompts, agreement
-        from scenefuse.masks.propagation import one_photo
-        from scenefuse.photos.workspace import View
-
-        assert self._ask is not None
-        view = View(name, np.eye(3), np.eye(4), pixels.shape[1], pixels.shape[0], pixels)
-        mask, _, _, left_out = one_photo(self._ask, view, clicks, tolerance_px)
-        return mask, agreement(mask, Prompts(every.on, every.off), tolerance_px), left_out
 
     def _pixels(self, picture: Picture) -> NDArray[np.uint8]:
         """The photo as the network sees it; always the same array while it is kept."""
@@ -241,9 +219,9 @@ def _clicks_of(picture: Picture, rows: Rows, width: int, height: int) -> "PhotoC
     own = [row for row in rows if row.photo == picture.name]
     scale, edge = np.array([width / picture.width, height / picture.height]), np.array([width, height]) - 1e-3
     points = [row for row in own if row.label != "box"]
-    at, box = (
-        np.clip(np.array([(row.x_px, row.y_px) for row in part]).reshape(-1, 2) * scale, 0, edge)
-        for part in (points, [row for row in own if row.label == "box"])
+    original, corner = (
+        np.array([row.pixel for row in part]).reshape(-1, 2) for part in (points, [r for r in own if r.label == "box"])
     )
+    at, box = (np.clip(pixels * scale, 0, edge) for pixels in (original, corner))
     inside = np.array([row.label == "inside" for row in points], dtype=bool)
-    return PhotoClicks(at, inside, np.stack([box.min(0), box.max(0)]) if len(box) == 2 else None)
+    return PhotoClicks(at, inside, np.stack([box.min(0), box.max(0)]) if len(box) == 2 else None, original)

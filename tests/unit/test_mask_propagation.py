@@ -130,16 +130,42 @@ def test_too_few_clicks_left_is_an_error_that_names_them(photos):
 
 
 def test_a_mask_that_agrees_with_some_clicks_only_is_used_and_said_where_there_is_no_better(photos):
-    calls = []
-
     def segment(view, prompts, box):
-        calls.append(view.name)
         # Without the click that contradicts the first answer, the next one lacks another click.
-        return [true_mask(view) & (np.arange(WIDTH) > (0 if len(calls) == 1 else 56))], np.ones(1)
+        return [true_mask(view) & (np.arange(WIDTH) > (0 if len(prompts.clicked) == 4 else 56))], np.ones(1)
 
     found = propagate(segment, photos, {3: clicks([(50, 45), (60, 45), (62, 47), (100, 45)])}, 0)
     assert found.masks[3].any() and len(found.left_out) > 0
     assert "f03.png agrees with 0.67 of its clicks" in found.notes[0] and "correct or add clicks" in found.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("better_without", "left_out"),
+    [("agreement", True), ("quality", True), ("nothing", False), ("too few clicks", False)],
+)
+def test_a_box_that_makes_a_mask_worse_is_left_out_where_the_clicks_are_enough(photos, better_without, left_out):
+    own = [(50, 45), (60, 45), (62, 47)][: 2 if better_without == "too few clicks" else 3]
+
+    def segment(view, prompts, box):
+        cut = 56 if box is not None and better_without != "quality" else 0
+        sure = 0.9 if box is None and better_without == "quality" else 0.8
+        mask = true_mask(view)
+        return [mask & (np.arange(WIDTH) > (0 if better_without == "nothing" else cut))], np.array([sure])
+
+    marked = replace(clicks(own), box=np.array([(56.0, 20.0), (90.0, 70.0)]))
+    found = propagate(segment, photos, {3: marked}, 0)
+    assert any("the box in f03.png: without it" in sentence for sentence in found.left_out) == left_out
+    assert (found.clicked[3].box is None) == left_out
+    assert np.array_equal(found.masks[3], true_mask(photos.views[3])) or not left_out
+
+
+def test_a_last_click_that_makes_a_mask_worse_is_left_out(photos):
+    def segment(view, prompts, box):
+        return [true_mask(view) & (np.arange(WIDTH) > (57 if len(prompts.clicked) == 4 else 0))], np.ones(1)
+
+    found = propagate(segment, photos, {3: clicks([(50, 45), (60, 45), (55, 45), (61, 45)])}, 0)
+    assert "the click inside at (61, 45) in f03.png: without it" in found.left_out[0]
+    assert np.array_equal(found.masks[3], true_mask(photos.views[3]))
 
 
 def test_clicks_on_two_objects_and_a_mask_of_most_of_the_photo_are_said(photos):
