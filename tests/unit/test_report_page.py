@@ -274,6 +274,56 @@ def test_a_phone_shows_turns_and_measures_without_scrolling_sideways(page):
         assert phone.complaints() == []
 
 
+# A client's questions, and what answers each.
+QUESTIONS = {
+    "how large is it?": r"11\.4 m × 10\.1 m, 7\.85 m high",
+    "how exact?": r"standard deviation of a point 6\.92 mm on the object",
+    "what is missing?": r"2\.0 % is missing: 0\.9 % seen by no photo",
+    "which CRS?": r"UTM zone 32N \(EPSG:25832\)",
+    "when?": "2024-06-01",
+    "how many photos?": "40 of 40 used",
+    "may I trust the scale?": r"its scale is known to 0\.1 %",
+    "where is the file?": r"objects/house/fused\.ply",
+    "what next?": r"photograph it from 4 places \(objects/house/next_photos\.csv\)",
+    "who made it?": r"Made by scenefuse \d",
+}
+SHOWN = """
+const found = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+while (walker.nextNode()) {
+  const range = document.createRange();
+  range.selectNodeContents(walker.currentNode);
+  const { left, right, bottom } = range.getBoundingClientRect();
+  if (walker.currentNode.parentElement.checkVisibility() && left >= 0 && right <= innerWidth)
+    found.push([(bottom + scrollY) / innerHeight, walker.currentNode.data]);
+}
+return found;
+"""
+
+
+@pytest.mark.parametrize(("phone", "screens"), [(False, 2), (True, 3)])
+def test_a_clients_questions_are_answered_by_the_first_screens(tmp_path, phone, screens):
+    page = report(tmp_path, {"house": None})
+    rows = {
+        "scenes": "scene=yard length_unit=m points=900 completed_points=1000 completed_by=house crs=EPSG:25832"
+        " photographed=2024-06-01 photos=60 registered=60",
+        "objects": "object=house scene=yard status=registered unit=m length=11.4 width=10.1 height=7.85"
+        " surface_missing=0.02 surface_never_seen=0.009 deviation=0.00692 world_deviation=0.0129"
+        " scale_sd_log=0.001 registered=40 frames=40 added_points=75 stations=4 stations_show=0.7",
+    }
+    for name, row in rows.items():
+        columns, cells = zip(*(pair.split("=") for pair in row.split()))
+        (tmp_path / f"summary/{name}.tsv").write_text("\t".join(columns) + "\n" + "\t".join(cells) + "\n")
+    (tmp_path / "yard").mkdir()
+    known = {"scenes": [tmp_path / "yard"], "objects": [tmp_path / "house"], "title": "test", "report": page}
+    write_report(summary=tmp_path / "summary", **known)
+    with chromium("--window-size=1400,900", phone=phone) as window:
+        window.open(page)
+        shown = [text for at, text in window.value(SHOWN) if at <= screens]
+        assert window.complaints() == []
+    said = "\n".join(shown)
+    assert [question for question, answer in QUESTIONS.items() if not re.search(answer, said, re.IGNORECASE)] == []
+
+
 def test_a_browser_without_webgl_says_so(page):
     with chromium("--disable-gpu", "--disable-3d-apis") as old:
         old.open(page)
