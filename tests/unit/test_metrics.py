@@ -18,7 +18,7 @@ from scenefuse.metrics.completion import (
     surface_variation,
 )
 from scenefuse.metrics.compute_metrics import box_size, compute_metrics, compute_scene_metrics
-from scenefuse.register.agreement import MAX_COMPARED_POINTS, registration_metrics, self_consistency
+from scenefuse.register.agreement import SAMPLED_POINTS, registration_metrics, self_consistency
 
 SETTINGS = MetricSettings(
     variation_spacings=8.0,
@@ -74,7 +74,7 @@ def test_self_consistency_is_of_both_whole_clouds_at_their_own_density():
     """A ripple whose normals turn by 90 degrees every half unit: a thinned cloud has more of its neighbours there."""
     x, y = np.meshgrid(np.arange(0, 60, 0.05), np.arange(0, 6, 0.05))
     ripple = np.stack([x.ravel(), y.ravel(), np.abs(x.ravel() % 1 - 0.5)], axis=1)
-    assert len(ripple) > 7 * MAX_COMPARED_POINTS
+    assert len(ripple) > 7 * SAMPLED_POINTS
     assert self_consistency(ripple) > 0.93 > 0.9 > self_consistency(ripple[::7])
     flat, far = grid(30), ball(900) * 30 + [500, 0, 0]
     alone, both = (
