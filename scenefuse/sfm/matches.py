@@ -25,6 +25,7 @@ from scenefuse.photos.geodesy import local_frame
 from scenefuse.photos.photos import Photo, gps_positions, read_photos
 from scenefuse.sfm.colmap import cancellable, require_database
 from scenefuse.sfm.features import FEW_FEATURES
+from scenefuse.sfm.guided import match_guided
 
 Pair = tuple[str, str]
 
@@ -100,6 +101,9 @@ def match_features(
                 device=pycolmap.Device.cpu,
             )
         with pycolmap.Database.open(temporary) as opened:
+            if settings.guided_matching:
+                error_px = _verification(seed).ransac.max_error
+                match_guided(opened, error_px, settings.max_ratio, MAX_DISTANCE)
             _, per_pair = opened.read_two_view_geometry_num_inliers()
             median = int(np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()]))
         verified, inliers = int(np.count_nonzero(per_pair)), int(np.sum(per_pair))
@@ -126,7 +130,6 @@ def _matching(settings: MatchSettings) -> pycolmap.FeatureMatchingOptions:
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads()
     options.use_gpu = False
-    options.guided_matching = settings.guided_matching
     options.sift.max_ratio = settings.max_ratio
     options.sift.max_distance = MAX_DISTANCE
     options.sift.cross_check = True

@@ -1,3 +1,4 @@
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,14 @@ from scenefuse.sfm.colmap import cancellable, require_database
 from scenefuse.sfm.explained import doubtful_photos, explained_matches
 from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
 from scenefuse.sfm.mapping import MappingSettings, map_photos
-from scenefuse.sfm.matches import MatchSettings, choose_pairs, match_features, sequential_pairs, spatial_pairs
+from scenefuse.sfm.matches import (
+    MAX_DISTANCE,
+    MatchSettings,
+    choose_pairs,
+    match_features,
+    sequential_pairs,
+    spatial_pairs,
+)
 from scenefuse.sfm.undistort import UndistortSettings, undistort_photos, undistort_picture
 
 PAIRS = MatchSettings(spatial_from=10, exhaustive_up_to=20, neighbours=3, overlap=2, loop_every=4)
@@ -241,6 +249,33 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
             settings=UndistortSettings(max_size_px=120),
         )
     assert not (tmp_path / "none").exists()
+
+
+def test_guided_matches_are_those_of_colmap(capture, tmp_path):
+    folder, _ = capture
+    photos, features = folder / "photos.json", tmp_path / "features.db"
+    extract_features(folder=folder / "upright", photos=photos, features=features, settings=FEATURES)
+    shutil.copyfile(features, tmp_path / "colmap.db")
+    options = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
+    options.sift.max_ratio, options.sift.max_distance = PAIRS.max_ratio, MAX_DISTANCE
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    pycolmap.match_exhaustive(tmp_path / "colmap.db", options, verification_options=verification)
+    for name, guided in (("plain", False), ("ours", True)):
+        match_features(
+            photos=photos, features=features, database=tmp_path / f"{name}.db", matches=tmp_path / f"{name}.json",
+            settings=replace(PAIRS, guided_matching=guided), seed=0,
+        )  # fmt: skip
+    plain, ours, theirs = (inliers_of(tmp_path / f"{name}.db") for name in ("plain", "ours", "colmap"))
+    assert len(ours & theirs) > 0.97 * max(len(ours), len(theirs)) and len(ours) > 1.03 * len(plain)
+    assert read_json(tmp_path / "ours.json")["inlier_matches"]["value"] == len(ours)
+
+
+def inliers_of(database):
+    """Photos and features of all verified matches."""
+    with pycolmap.Database.open(database) as opened:
+        pairs = map(pycolmap.pair_id_to_image_pair, opened.read_two_view_geometry_num_inliers()[0])
+        return {(*p, *m) for p in pairs for m in opened.read_two_view_geometry(*p).inlier_matches.tolist()}
 
 
 def test_a_model_that_is_upright_already_says_so_in_its_workspace(capture, tmp_path):
