@@ -24,7 +24,7 @@ BYTES = {"feature": 450, "photo": 2, "scene": 19, "object": 60}
 JOB_S = 4.0
 # A megapixel that is searched for features, enlarged ones too; two photos, times the features of both; a photo in the
 # mapping, times its features.
-FEATURES_S, PAIR_S, MAPPING_S = 0.3, 2.4e-8, 7e-4
+FEATURES_S, PAIR_S, MAPPING_S = 0.3, 6e-9, 7e-4
 # A megapixel of a scene's depth maps: stereo, fusion, and how uncertain they are.
 STEREO_S, FUSION_S, SPREAD_S = 6.5, 1.2, 2.2
 MASK_S = {"sam2": 13.0, "grabcut": 0.9}
