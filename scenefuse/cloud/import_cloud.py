@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scenefuse.cloud.cloud_file import FileSummary, summarise
+from scenefuse.cloud.cloud_file import STRAY_PERCENT, FileSummary, summarise, without_strays
 from scenefuse.cloud.clouds import (
     Cloud,
     cloud_of,
@@ -22,7 +22,6 @@ from scenefuse.cloud.formats import check_not_degrees, columns_in_parts
 from scenefuse.cloud.readers.columns import Columns
 from scenefuse.cloud.readers.las import LAS_DIMENSIONS, WITHHELD, las_crs, las_dimensions
 from scenefuse.cloud.readers.text import text_notes
-from scenefuse.cloud.strays import STRAY_PERCENT, without_strays
 from scenefuse.cloud.tiled_cloud import open_cloud, write_tiled
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Array, Sim3
@@ -227,8 +226,6 @@ class ImportedFile:
             "diagonal": quantity(diagonal, unit),
             "source": quantity(source.name, ""),
             "columns_not_used": quantity(self.unused, ""),
-            "has_colors": quantity(self.summary.white is not None, ""),
-            "has_normals": quantity(bool(self.unit_normals), ""),
             "notes": quantity(notes, ""),
         }
 

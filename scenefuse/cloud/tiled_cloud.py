@@ -31,8 +31,8 @@ BOX = ("low_x", "low_y", "low_z", "high_x", "high_y", "high_z")
 ROW_OF_TILE = np.dtype([("count", "<u4"), *((name, "<f8") for name in BOX)])
 # The box of a cloud is divided into one cell for so many points; most are empty.
 POINTS_A_CELL = 1 << 10
-# Of a cell's place along an axis, at most.
-CELL_BITS = 20
+# Places along three axes in one integer.
+MORTON_BITS = 21
 # Points outside this percentile of a sample on each side lie in the outermost cells: strays far off widen none.
 OUTER_PERCENT = 0.1
 
@@ -261,14 +261,14 @@ class _Grid:
         low, high = np.percentile(sample, [OUTER_PERCENT, 100 - OUTER_PERCENT], axis=0)
         most = min(AT_ONCE, count // POINTS_A_CELL) if count > WHOLE else 1
         side, shape = max(float((high - low).max()), 1e-300), np.ones(3, np.int64)
-        for _ in range(CELL_BITS):
+        for _ in range(MORTON_BITS):
             finer = np.ceil((high - low) / (side / 2)).astype(np.int64).clip(1)
             if finer.prod() > most:
                 break
             side, shape = side / 2, finer
         index = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
         rank = np.empty(len(index), np.int64)
-        rank[np.argsort(_morton(index), kind="stable")] = np.arange(len(index))
+        rank[np.argsort(morton(index), kind="stable")] = np.arange(len(index))
         return _Grid(low, side, shape, rank)
 
     def cells(self, points: Array) -> Rows:
@@ -277,10 +277,10 @@ class _Grid:
         return np.asarray(self.rank[(index[:, 0] * self.shape[1] + index[:, 1]) * self.shape[2] + index[:, 2]])
 
 
-def _morton(index: NDArray[np.int64]) -> NDArray[np.int64]:
+def morton(index: NDArray[np.int64]) -> NDArray[np.int64]:
     """(C,) places along a Morton curve of cells (C, 3)."""
     keys = np.zeros(len(index), dtype=np.int64)
-    for bit in range(CELL_BITS):
+    for bit in range(MORTON_BITS):
         for axis in range(3):
             keys |= ((index[:, axis] >> bit) & 1) << (3 * bit + axis)
     return keys

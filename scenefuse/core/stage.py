@@ -83,15 +83,6 @@ def run(function: Callable[..., Any]) -> None:
         signal.signal(number, _exit_on_signal)
     try:
         status = tyro.cli(function, config=(tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes))
-    except StageError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
-    except OSError as error:
-        said = _of_files(error)
-        if not said:
-            raise
-        print(f"error: {said}", file=sys.stderr)
-        sys.exit(1)
     except SystemExit as stop:
         # tyro's, of words that it does not know.
         if stop.code == 2 and "SCENEFUSE" in os.environ:
@@ -99,10 +90,11 @@ def run(function: Callable[..., Any]) -> None:
             print(f"error: the stage does not know its command's options (above): {mixed}", file=sys.stderr)
         raise
     except Exception as error:
-        why = lack_in(error)
-        if not why:
+        of_files = _of_files(error) if isinstance(error, OSError) else ""
+        said = str(error) if isinstance(error, StageError) else of_files or lack_in(error)
+        if not said:
             raise
-        print(f"error: {why}", file=sys.stderr)
+        print(f"error: {said}", file=sys.stderr)
         sys.exit(1)
     if isinstance(status, int):
         sys.exit(status)
@@ -130,7 +122,7 @@ def lack_in(said: BaseException | str | None) -> str:
 
 def _find_cause(error: Exception, folder: Path) -> None:
     """Raise what a library's error does not say: the folder cannot be written to, or its disk is full."""
-    if isinstance(error, OSError):
+    if isinstance(error, OSError | StageError):
         return
     number = 0
     if not os.access(folder, os.W_OK):

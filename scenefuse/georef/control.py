@@ -13,8 +13,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.georef.control_file import ControlFile, SurveyedPoint, read_control, unknown_photo
 from scenefuse.marks.clicks import Click, in_photos
-from scenefuse.marks.lengths import MAX_CLICK_MISS
-from scenefuse.marks.triangulation import intersect, model_pixel
+from scenefuse.marks.triangulation import MAX_CLICK_MISS, intersect, model_pixel
 from scenefuse.photos.photos import Photo
 
 # Fewest control points that fix a model.

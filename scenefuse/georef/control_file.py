@@ -12,7 +12,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.tables import comma_advice, read_lines
 from scenefuse.core.transforms import Array
 from scenefuse.marks.clicks import Click, in_photos
-from scenefuse.marks.lengths import read_ends
+from scenefuse.marks.triangulation import read_ends
 from scenefuse.photos.photo_files import SUFFIXES
 
 # A point whose name begins so is a check point, as OpenDroneMap's users mark it.

@@ -28,7 +28,7 @@ from scenefuse.georef.placement import (
     upright,
 )
 from scenefuse.georef.residuals import Georeference, georeference_report, residuals_of, write_residuals
-from scenefuse.marks.lengths import read_lengths
+from scenefuse.marks.triangulation import read_lengths
 from scenefuse.photos.cameras.place import Place, read_place
 from scenefuse.photos.geodesy import LocalFrame, local_frame
 from scenefuse.photos.photos import Photo, gps_accuracies, gps_positions, read_photos

@@ -11,13 +11,12 @@ import pyproj
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.cloud_file import CloudFile
+from scenefuse.cloud.cloud_file import STRAY_PERCENT, CloudFile
 from scenefuse.cloud.clouds import spacing
 from scenefuse.cloud.crs import check_place, grid_name, to_wgs84, usable
 from scenefuse.cloud.formats import readable
 from scenefuse.cloud.import_cloud import crs_of
 from scenefuse.cloud.readers.las import check_projected
-from scenefuse.cloud.strays import STRAY_PERCENT
 from scenefuse.core.stage import StageError, quantity, threads, value
 from scenefuse.core.transforms import Array, Sim3, box_corners, rotation_angle_deg
 from scenefuse.geometry.icp import refine_on_cloud
@@ -42,8 +41,6 @@ MAX_MET_SHARE = 0.002
 MIN_OVER = 50
 # What GPS is off at most, in metres: the cloud is looked at so far beyond the model.
 MAX_GPS_ERROR_M = 30.0
-# ICP goes on until a round of steps moves no point by more than this share of the model's extent.
-MAX_STEP = 1e-3
 # What is reported of a fit in any case.
 FIT = ("seen_share", "met_share")
 
@@ -85,7 +82,6 @@ def fit_to_cameras(points: Array, model: pycolmap.Reconstruction) -> dict[str, A
     off = float(np.linalg.norm(moved.apply(middle) - middle))
     return content | {
         "met_share_if_moved": quantity(_met(points, moved.apply(own), centres), "1"),
-        "moved_by": quantity(off, "units of the given cameras"),
         "moved_by_over_distance": quantity(off / float(np.median(np.linalg.norm(centres - middle, axis=1))), "1"),
         "turned_by_deg": quantity(rotation_angle_deg(moved.rotation), "deg"),
         "scaled_by_pct": quantity(100 * (moved.scale - 1), "%"),
@@ -224,7 +220,8 @@ def _onto(cloud: Array, own: Array, name: str) -> Sim3:
             " needed; give a cloud that shows more of what the photos do"
         )
     moved = Sim3(1.0, np.eye(3), np.array([0.0, 0.0, _height_above(cloud, own[over])]))
-    stays = MAX_STEP * float(np.linalg.norm(np.ptp(own, axis=0)))
+    # Until a round of steps moves no point by more than a thousandth of the model's extent.
+    stays = 1e-3 * float(np.linalg.norm(np.ptp(own, axis=0)))
     for _ in range(10):
         here = moved.apply(own)
         here = here[_over(cloud, here)]

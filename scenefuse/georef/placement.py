@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 MIN_GPS_PHOTOS = 5
 # In standard errors of a position: what is farther from its camera is an outlier; a flight that spreads less says
 # nothing about scale; one that is narrower lies along one line and says nothing about roll.
-OUTLIER_SD, MIN_SPREAD, MIN_WIDTH = 4.0, 5.0, 3.0
+OUTLIER_SD = 4.0
 # Heights of GPS have twice the error of the plane, and so many photos beside each other have one error.
 HEIGHT_ERROR, PHOTOS_OF_ONE_ERROR = 2.0, 5.0
 # How far a model that was not yet adjusted to exact positions may be bent away from them, as a share of their extent.
@@ -220,13 +220,13 @@ def place_by_gps(
 
     Unknown heights are NaN and take no part. Positions along one line leave the roll about it open, and horizontal ones
     the tilt: then the cameras' up direction (3,) closes it; also where it is sure, and heights that fix the tilt less
-    well contradict it, as a phone's do on a walk around a house. Positions within five times the GPS accuracy of each
+    well contradict it, as a phone's do on a walk around a house. Positions within four times the GPS accuracy of each
     other say nothing about scale: then the model is only turned upright. `sd_m` is the accuracy that the positions
     state.
     """
     accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target)
     limit = _limit(accuracy_m, extent[0], settings)
-    if extent[0] < MIN_SPREAD * accuracy_m:
+    if extent[0] < OUTLIER_SD * accuracy_m:
         reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {accuracy_m:g} m"
         return upright(up, reason)
     fitted, inliers, levelled = _fit(centres, target, up, accuracy_m, limit, seed, sure_up)
@@ -235,7 +235,7 @@ def place_by_gps(
         return upright(up, reason)
     reason = f"{inliers.sum()} of {len(target)} photos by GPS"
     if levelled:
-        line = "along one line, " if _extent(target[inliers])[1] < MIN_WIDTH * accuracy_m else ""
+        line = "along one line, " if _extent(target[inliers])[1] < OUTLIER_SD * accuracy_m else ""
         reason += f", {line}levelled by the cameras"
     unknown = np.isnan(target[:, 2])
     if unknown.all():
@@ -252,7 +252,7 @@ def _fit(
     has_height = np.isfinite(target[:, 2])
 
     def fixes_tilt(rows: NDArray[np.bool_]) -> bool:
-        return bool(rows.sum() >= MIN_GPS_PHOTOS and _extent(target[rows])[1] >= MIN_WIDTH * accuracy_m)
+        return bool(rows.sum() >= MIN_GPS_PHOTOS and _extent(target[rows])[1] >= OUTLIER_SD * accuracy_m)
 
     def leans(fitted: Sim3, rows: NDArray[np.bool_]) -> bool:
         lean = np.degrees(np.arccos(np.clip(fitted.rotate(up)[2] / np.linalg.norm(up), -1, 1)))

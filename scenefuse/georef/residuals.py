@@ -12,7 +12,7 @@ from scenefuse.core.stage import atomic_file, quantity
 from scenefuse.core.transforms import Array
 from scenefuse.georef.control import Control, LocatedPoint, seen_at
 from scenefuse.georef.placement import OUTLIER_SD, GpsCameras, Placement
-from scenefuse.marks.lengths import Lengths
+from scenefuse.marks.triangulation import Lengths
 from scenefuse.photos.geodesy import LocalFrame
 
 COLUMNS = ["kind", "name", "used", "error_m", "east_m", "north_m", "up_m", "horizontal_sd_m", "vertical_sd_m"]
@@ -151,7 +151,6 @@ def _of_lengths(lengths: Lengths, status: str) -> dict[str, Any]:
     content = {
         "lengths": quantity(len(error), "1"),
         "lengths_used": quantity(status == "scaled", ""),
-        "length_errors_m": quantity(dict(zip(lengths.names, error.round(5).tolist())), "m"),
         "length_rms_m": quantity(rms(error[:, None]), "m"),
         "length_rms_pct": quantity(100 * (rms(error[:, None] / lengths.metres[:, None]) or 0.0), "%"),
     }
@@ -210,7 +209,6 @@ def _of_cameras(found: Georeference, left: Residuals) -> dict[str, Any]:
         "gps_residual_rms_m": quantity(whole, "m"),
         "gps_residual_horizontal_rms_m": quantity(rms(left.cameras[inliers, :2]), "m"),
         "gps_residual_vertical_rms_m": quantity(rms(left.cameras[inliers, 2:]), "m"),
-        "gps_residuals_m": quantity(dict(zip(gps.names, distance.round(4).tolist())), "m"),
         "gps_outliers": quantity([name for name, ok in zip(gps.names, inliers) if not ok], ""),
         "gps_accuracy_m": quantity(np.median(gps.sd_m, axis=0), "m"),
     }

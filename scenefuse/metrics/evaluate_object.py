@@ -13,12 +13,12 @@ from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
 from scenefuse.fuse.write import after_fusion
 from scenefuse.geometry.visual_hull import mask_iou
-from scenefuse.metrics.scores import THRESHOLDS, nearest, scores_at
 from scenefuse.metrics.true_cameras import Cameras, visible
 from scenefuse.metrics.true_cameras import read_cameras as read_true_cameras
 from scenefuse.metrics.truth import (
     HIDDEN,
     SAMPLES,
+    THRESHOLDS,
     CameraFit,
     Mesh,
     Posed,
@@ -27,11 +27,13 @@ from scenefuse.metrics.truth import (
     cast_together,
     distances,
     fit_cameras,
+    nearest,
     print_results,
     read_mesh,
     read_posed,
     registration_error,
     sample_surface,
+    scores_at,
     true_depth,
 )
 from scenefuse.photos.pictures import read_depth, read_gray

@@ -10,7 +10,6 @@ from scenefuse.cloud.clouds import sampled_rows
 from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.metrics.scores import nearest
 from scenefuse.metrics.true_cameras import Cameras, read_cameras, visible
 from scenefuse.metrics.truth import (
     HIDDEN,
@@ -21,6 +20,7 @@ from scenefuse.metrics.truth import (
     cast_together,
     distances,
     fit_cameras,
+    nearest,
     print_results,
     read_mesh,
     read_posed,

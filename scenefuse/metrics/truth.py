@@ -1,4 +1,4 @@
-"""Errors against a known truth: cameras, depth, surfaces, registrations. Arrays in, numbers out."""
+"""Errors against a known truth: cameras, depth, surfaces with their F-scores, registrations. Arrays in, numbers out."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from scenefuse.core.stage import StageError, quantity, threads
 from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
@@ -19,6 +20,8 @@ Posed = list[tuple[View, int]]
 HIDDEN = 0.02
 # Points drawn from a true surface, and from a cloud for its distances to the truth.
 SAMPLES = 60_000
+# Distances at which clouds are scored, as shares of the object's diagonal, by the ending of their keys.
+THRESHOLDS = {"025pct": 0.0025, "05pct": 0.005, "1pct": 0.01, "2pct": 0.02}
 
 
 @dataclass(frozen=True)
@@ -209,3 +212,37 @@ def print_results(result: dict[str, Any]) -> None:
     for name, entry in result.items():
         if isinstance(entry.get("value"), float | int):
             print(f"{name}: {entry['value']:.5g} {entry['unit']}", flush=True)
+
+
+def f_score(
+    cloud_to_truth: NDArray[np.floating], truth_to_cloud: NDArray[np.floating], tau: float
+) -> tuple[float, float, float]:
+    """Precision, recall and their harmonic mean at a distance `tau`."""
+    precision = float((cloud_to_truth <= tau).mean()) if len(cloud_to_truth) else 0.0
+    recall = float((truth_to_cloud <= tau).mean()) if len(truth_to_cloud) else 0.0
+    total = precision + recall
+    return precision, recall, 2 * precision * recall / total if total > 0 else 0.0
+
+
+def scores_at(
+    cloud_to_truth: NDArray[np.floating], truth_to_cloud: NDArray[np.floating], diagonal: float
+) -> dict[str, dict[str, float]]:
+    """F-score, precision and recall at each of THRESHOLDS (method G8): {"1pct": {"f_score": ..., ...}, ...}.
+
+    Args:
+        cloud_to_truth: (N,) distances of the cloud's points to the true surface.
+        truth_to_cloud: (M,) distances of points on the true surface to the cloud.
+        diagonal: of the object's true bounding box, in the unit of the distances.
+    """
+    found = {}
+    for ending, share in THRESHOLDS.items():
+        precision, recall, score = f_score(cloud_to_truth, truth_to_cloud, share * diagonal)
+        found[ending] = {"f_score": score, "precision": precision, "recall": recall}
+    return found
+
+
+def nearest(points: Array, cloud: Array) -> Array:
+    """(N,) distance of each of (N, 3) points to the nearest point of a cloud; infinite when it is empty."""
+    if len(cloud) == 0:
+        return np.full(len(points), np.inf)
+    return cKDTree(cloud).query(points, workers=threads())[0]

@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import yaml
 
 from scenefuse.core.job_records import JobRecords
 from scenefuse.core.stage import StageError, atomic_file, read_json, setting
 from scenefuse.core.transforms import Sim3, fit_sim3
 from scenefuse.paper.paper_tables import (
+    ASSETS,
     COMMON,
     HERE,
     NULL,
@@ -35,24 +37,7 @@ from scenefuse.report.run_summary import ObjectSummary, RunInputs, summarise
 from scenefuse.report.values import find, load, number
 
 _HEADINGS = (PAPER, HERE, SCENEFUSE, COMMON, NULL)
-_TITLES = {
-    "2": "registration",
-    "3": "completion",
-    "4": "registration without scale rectification (no_scale), without the crop (no_crop)",
-}
-_ABOUT = (
-    f"{PAPER}: what it states for its own captures of such objects; its thresholds are not known. {HERE}: this run."
-    f" {SCENEFUSE}: a run of the shipped recipe on the same photos, by the same definitions, on its own crop."
-    f" {COMMON}: its pose on this run's crop, which may hold ground, as the fiducials' box has it (Table 2)."
-    f" {NULL}: the same for a random cloud in the place of the object (Tables 2, 4) or of the added points (Table 3);"
-    " only a clear distance from it says something. Labels like R10 are those of docs/method."
-)
-_FIGURES = (
-    "Its figures have their counterparts on this page and in results/. Figure 2, the scene and its incomplete objects:"
-    " (a) scenes/SCENE/scene.png, (b) the row before of objects/OBJECT/figures/before_after.png, large in before.png."
-    " Figure 3, the objects reconstructed: figures/object.png. Figure 5, before and after completion:"
-    " figures/before_after.png, large in before.png and after.png."
-)
+_TEXTS = yaml.safe_load((ASSETS / "section.yaml").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True)
@@ -185,8 +170,8 @@ def _tau_share(item: ObjectSummary) -> float | None:
 def paper_section(rows: list[dict[str, str]]) -> str:
     """Heading, notes and tables from the rows of paper.tsv."""
     parts = ['<h2 id="paper">The paper\'s Tables 2, 3 and 4</h2>']
-    parts += [f"<p>{escape(text)}</p>" for text in (_ABOUT, _FIGURES, *_notes(rows))]
-    for table, title in _TITLES.items():
+    parts += [f"<p>{escape(text)}</p>" for text in (*_TEXTS["about"], *_notes(rows))]
+    for table, title in _TEXTS["tables"].items():
         parts.append(f"<h3>Table {table}: {title}</h3>{_table([row for row in rows if row['table'] == table])}")
     return "\n".join(parts)
 

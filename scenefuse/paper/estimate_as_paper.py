@@ -20,16 +20,18 @@ from scenefuse.nerf.monodepth import sample
 from scenefuse.nerf.prior_inputs import DepthPhotos, depth_photos
 from scenefuse.nerf.prior_training import Recipe, loss_quantities, optimise, predict, prepare_torch
 from scenefuse.nerf.refine_depth import DepthPrior, read_stage_maps, write_prior
-from scenefuse.nerf.train_depth import align_maps, residual_at_checks
+from scenefuse.nerf.train_depth import align_maps
 from scenefuse.nerf.train_object_nerf import MIN_CONFIDENCE
-from scenefuse.paper.fused_depth import Content, blend_depths, map_quantities
 from scenefuse.paper.monocular import (
+    Content,
     MonocularSettings,
     Networks,
     PoseNetwork,
     Supervision,
+    blend_depths,
     frames_of,
     load_networks,
+    map_quantities,
     monocular_losses,
     new_monocular_networks,
     pose_quantities,
@@ -108,8 +110,6 @@ def chain_quantities(own: Array, known: Array, used: Array, pose_source: str) ->
     error = trajectory_error("chain", own, known)
     return {
         "pose_source": quantity(pose_source, ""),
-        "photos_with_pose": quantity(len(known), "1"),
-        "chain_is_a_trajectory": quantity(bool(error), ""),
         "frame": quantity("sfm", ""),
         "up_in_camera_frame": quantity(estimate_up(used[:, :3, :3], used[:, :3, 3])[0], "1"),
         **error,
@@ -240,13 +240,11 @@ class Stage:
         write_posed(self.workspace, self.outputs.posed, self.views, placed.poses)
         chain = chain_quantities(placed.chain, known, placed.poses, self.pose_source)
         write_json(self.outputs.posed_json, chain)
-        aligned = residual_at_checks(align_maps(placed.depth, placed.measured), placed.measured)
         content |= {
             "steps": quantity(recipe.steps(self.frames), "1"),
             **{name: part for name, part in chain.items() if name not in ("frame", "up_in_camera_frame")},
             "unit": quantity(placed.unit, "object units per unit of the networks"),
             **map_quantities(depth, placed.measured),
-            "residual_each_map_aligned": quantity(aligned, "1"),
             **loss_quantities(losses),
             **pose_quantities(networks.pose, self.frames, in_unit(known, placed.unit)),
             "seconds": quantity(round(time.monotonic() - start, 1), "s"),

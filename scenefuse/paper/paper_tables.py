@@ -30,32 +30,15 @@ def _rows_of(name: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file, delimiter="\t"))
 
 
-@dataclass(frozen=True)
-class Measure:
-    """A measure of the paper.
-
-    Attributes:
-        name: as in metrics.json.
-        paper: what the paper calls it.
-        definition: of the numbers of all our columns, with its labels in docs/method.
-        group: of metrics.json that holds it.
-    """
-
-    name: str
-    paper: str
-    definition: str
-    group: str
-
-
 _TAU = AgreementSettings().tau_fraction
+# Of each measure what the paper calls it, our definition with its labels in docs/method, and its group in metrics.json.
 MEASURES = {
-    row["measure"]: Measure(row["measure"], row["in_paper"], row["definition"].format(tau=_TAU), row["group"])
-    for row in _rows_of("measures.tsv")
+    row["measure"]: row | {"definition": row["definition"].format(tau=_TAU)} for row in _rows_of("measures.tsv")
 }
 # Number of the table, variant and measure of each row; and what the paper published there of its own captures, whose
 # objects the demo's are named after. RMSE is in metres; no diagonal is given to divide it by.
 PUBLISHED = _rows_of("published.tsv")
-ROWS = [(int(row["table"]), row["variant"], MEASURES[row["measure"]]) for row in PUBLISHED]
+ROWS = [(int(row["table"]), row["variant"], row["measure"]) for row in PUBLISHED]
 OBJECTS = ("house", "balloon", "sculpture")
 # Why a number of a run that has come so far may be missing, by group.
 _NOTHING = {"registration": "no point of the object within tau", "completion": "too few points were added"}
@@ -159,13 +142,13 @@ def on_crop_of(folder: Path, item: ObjectSummary, its_folder: Path, here_from_th
 
 def _measured(fields: Fields, ending: str = "") -> Fields:
     """The paper's measures of a variant, or those of an ending, by their names."""
-    keys = {m.name: f"metrics.{m.group}.{m.name}{ending}" for m in MEASURES.values()}
+    keys = {name: f"metrics.{measure['group']}.{name}{ending}" for name, measure in MEASURES.items()}
     return {name: fields[key] for name, key in keys.items() if key in fields}
 
 
 def _cells(found: Mapping[str, Fields]) -> dict[tuple[str, str], tuple[float, str]]:
     """The cells of a column from the measures of each variant."""
-    there = [(m.name, v, found[v][m.name]) for _, v, m in ROWS if m.name in found.get(v, {})]
+    there = [(name, v, found[v][name]) for _, v, name in ROWS if name in found.get(v, {})]
     return {(name, v): (float(x["value"]), str(x["unit"])) for name, v, x in there if x["value"] is not None}
 
 
@@ -181,11 +164,11 @@ def paper_rows(name: str, columns: Mapping[str, Column]) -> list[dict[str, Any]]
     """
     rows = []
     for table, variant, measure in ROWS:
-        key = measure.name, variant
+        key, about = (measure, variant), MEASURES[measure]
         units = [columns[h].cells[key][1] for h in (HERE, SCENEFUSE, NULL, PAPER) if key in columns[h].cells]
         unit = units[0] if units else None
-        row: dict[str, Any] = {"object": name, "table": table, "variant": variant, "measure": measure.name}
-        row |= {"in_paper": measure.paper, "definition": measure.definition, "unit": unit}
+        row: dict[str, Any] = {"object": name, "table": table, "variant": variant, "measure": measure}
+        row |= {"in_paper": about["in_paper"], "definition": about["definition"], "unit": unit}
         notes = []
         for heading, column in columns.items():
             cell, own = column.cells.get(key, (None, unit))
@@ -194,7 +177,7 @@ def paper_rows(name: str, columns: Mapping[str, Column]) -> list[dict[str, Any]]
             if own != unit:
                 why = f"{cell:.4g} {own}, in another unit"
             elif cell is None and column.measured:
-                why = why or _NOTHING[measure.group]
+                why = why or _NOTHING[about["group"]]
             notes += [f"{heading}: {why}"] if why else []
         rows.append(row | {"preset": columns[HERE].told or None, "note": "; ".join(notes) or None})
     return rows

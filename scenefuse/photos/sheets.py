@@ -1,6 +1,5 @@
-"""Sheets of pictures with captions: matplotlib for the layout, small PNG files."""
+"""Sheets of pictures with captions: matplotlib for the layout."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,7 +19,6 @@ Cell = tuple[str, Image | None]
 TILE_PX = (400, 300)
 # Between the pictures of a sheet, and for a line of text: a row's label, a caption.
 MARGIN_PX = 26
-MAX_BYTES = 950_000
 
 
 def draw_sheet(
@@ -74,21 +72,10 @@ def depth_colors(depth: NDArray[np.float32], low: float, high: float) -> Image:
 
 
 def save_png(path: Path, image: Image | Figure) -> None:
-    """Write a PNG below 1 MB: full colour if that fits, else 256 colours, else smaller."""
+    """Write a PNG."""
     if isinstance(image, Figure):
         assert isinstance(image.canvas, FigureCanvasAgg)
         image.canvas.draw()
         image = np.asarray(image.canvas.buffer_rgba())[..., :3].copy()
-    picture = Picture.fromarray(image)
-    data = _encode(picture)
-    while len(data) > MAX_BYTES:
-        data = _encode(picture.quantize(256, dither=Picture.Dither.NONE))
-        picture = picture.resize((picture.width * 9 // 10, picture.height * 9 // 10), Picture.Resampling.LANCZOS)
     with atomic_file(path) as temporary:
-        temporary.write_bytes(data)
-
-
-def _encode(picture: Picture.Image) -> bytes:
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG", compress_level=6)
-    return buffer.getvalue()
+        Picture.fromarray(image).save(temporary)

@@ -108,7 +108,7 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
 
     Args:
         inputs: see FigureInputs.
-        figures: output folder of PNG files, each below 1 MB, and the view.
+        figures: output folder of PNG files and the view.
 
     Raises:
         StageError: a cloud or JSON is missing or damaged.

@@ -14,25 +14,20 @@ from string import Template
 from typing import Any
 
 import numpy as np
+import yaml
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from PIL import Image
 
 from scenefuse.core.stage import StageError
 from scenefuse.report.values import asset
-from scenefuse.report.view import LEVELS, REMOVED, UNKNOWN, Shown, View, encode
+from scenefuse.report.view import LEVELS, REMOVED, Shown, View, encode
 
 # Of the scene, then of its objects in turn.
 SOURCE_COLORS = ("#c4c9ce", "#f07819", "#2f7fbf", "#3d9a5f", "#a45fb0", "#c9a227", "#4bb3b8", "#d1647f")
 REMOVED_COLOR, UNKNOWN_COLOR = "#b3261e", "#dfe2e5"
-# Colours that every kind of colour vision tells apart (after Okabe and Ito 2008), and labels of the field `evidence`.
-EVIDENCE = {
-    0: ("#a9b1b9", "not checked"),
-    1: ("#0f8a66", "measured: three photos confirm it, and its surroundings"),
-    2: ("#d55e00", "not measured: of the NeRF, or a given cloud"),
-    3: ("#b869a0", "not measured: of the scene's stereo"),
-    UNKNOWN: (UNKNOWN_COLOR, "not in the completed scene"),
-}
+# Colour and label of each number of the field `evidence`.
+EVIDENCE: dict[int, tuple[str, str]] = yaml.safe_load(asset("report.yaml"))["evidence"]
 Mode = dict[str, Any]
 
 
@@ -118,7 +113,7 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
     sources[REMOVED] = (REMOVED_COLOR, "scene, removed by fusion")
     modes.append({"name": "source", "button": "Source", "other": other, "entries": _entries(view, "source", sources)})
     evidence = view.cloud.fields.get("evidence", np.zeros(0))
-    if ((evidence > 0) & (evidence != UNKNOWN)).any():
+    if ((evidence > 0) & (evidence != REMOVED)).any():
         found = _entries(view, "evidence", EVIDENCE)
         modes.append({"name": "evidence", "button": "Class", "other": other, "entries": found})
     if deviations is not None:

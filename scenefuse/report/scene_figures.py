@@ -48,7 +48,7 @@ def draw_scene(
         residuals: what is left at positions by GPS (residuals.tsv); None where the scene was given as a cloud.
         objects: result folders of the scene's objects; the bounding box of registration/full/crop.ply is drawn.
         failed: names of the objects that failed; they get no box.
-        figure: output PNG, below 1 MB.
+        figure: output PNG.
 
     Raises:
         StageError: an input is missing.

@@ -3,7 +3,6 @@
 A run may be partial: a value that does not exist is empty, an object without results carries its last error.
 """
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,9 +12,7 @@ import pandas as pd
 import yaml
 
 from scenefuse.metrics.completion import MEASURES
-from scenefuse.metrics.scores import SCORES, THRESHOLDS
-from scenefuse.report.diagnosis import diagnose
-from scenefuse.report.facts import ground_pixel, photographed
+from scenefuse.report.facts import diagnose, ground_pixel, photographed
 from scenefuse.report.run_summary import RunSummary, SceneSummary, why_missing
 from scenefuse.report.values import Fields, asset, find, number, parts_of, unit_of
 
@@ -50,10 +47,10 @@ def completion_table(run: RunSummary) -> pd.DataFrame:
             if key.startswith("metrics.completion."):
                 name, column = _measure(key.removeprefix("metrics.completion."))
                 measures.setdefault(name, {"unit": entry["unit"]})[column] = plain(entry["value"])
-        for threshold, score in itertools.product(THRESHOLDS, SCORES):
-            cells = {w: number_in(item.stages, f"truth.scene_{score}_{w}_{threshold}") for w in ("before", "after")}
-            if cells["before"] is not None:
-                measures[f"scene_{score}_{threshold}"] = {"unit": "1", **cells}
+        for score, before, threshold in (key.partition("_before_") for key in item.stages):
+            if before and score.startswith("truth.scene_"):
+                cells = {w: find(item.stages, f"{score}_{w}_{threshold}") for w in ("before", "after")}
+                measures[f"{score.removeprefix('truth.')}_{threshold}"] = {"unit": "1", **cells}
         rows += [{"object": item.name, "measure": name, **cells} for name, cells in measures.items()]
     return pd.DataFrame(rows, columns=["object", "measure", "unit", "value", *BESIDE])
 

@@ -29,6 +29,7 @@ from scenefuse.cloud.clouds import (
     voxel_downsample,
     write_cloud,
 )
+from scenefuse.cloud.tiled_cloud import MORTON_BITS, morton
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.report.render import luminance, point_radii
@@ -42,16 +43,14 @@ class Shown(IntEnum):
     BOTH, BEFORE, AFTER = range(3)
 
 
-# `source` of a point that fusion took away; `evidence` of a point that the completed cloud does not hold.
-REMOVED = UNKNOWN = 255
+# `source` and `evidence` of a point that fusion took away.
+REMOVED = 255
 # Points of one view: with three objects and a scene, the page stays well below 15 MB.
 VIEW_POINTS = 175_000
 # How far around an object its view and its figures show the scene, over the object's diagonal.
 REACH = 0.35
 # How much farther apart points stand that are not near: a reader looks at the objects.
 SURROUNDINGS_SPACING = 2.0
-# Three axes of a position in one integer: two points in one cell, a twentieth of a millimetre on 100 m, are the same.
-BITS_PER_AXIS = 21
 # Direction to the light that shades what is not in photo colours (high, from the left of the first picture), and the
 # shade of a surface that faces away from it.
 LIGHT, DARKEST_SHADE = np.array([-0.39, -0.55, 0.74]), 0.45
@@ -93,7 +92,8 @@ def merge(before: Cloud, after: Cloud) -> Cloud:
     """
     low = np.minimum(before.points.min(0), after.points.min(0))
     high = np.maximum(before.points.max(0), after.points.max(0))
-    step = max(float(np.linalg.norm(high - low)) / (2**BITS_PER_AXIS - 2), 1e-300)
+    # Two points in one cell, a twentieth of a millimetre on 100 m, are the same.
+    step = max(float(np.linalg.norm(high - low)) / (2**MORTON_BITS - 2), 1e-300)
     places, tints = zip(*((_places(cloud, low, step), _tints(cloud)) for cloud in (before, after)))
     keys = [place ^ tint for place, tint in zip(places, tints)]
     only_before, only_after = _not_in(keys[0], keys[1]), _not_in(keys[1], keys[0])
@@ -161,7 +161,7 @@ def _not_in(keys: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bo
 def _places(cloud: Cloud, low: Array, step: float) -> NDArray[np.int64]:
     """(N,) one number for a position."""
     cells = np.rint((cloud.points - low) / step).astype(np.int64)
-    return (cells[:, 0] << 2 * BITS_PER_AXIS) | (cells[:, 1] << BITS_PER_AXIS) | cells[:, 2]
+    return (cells[:, 0] << 2 * MORTON_BITS) | (cells[:, 1] << MORTON_BITS) | cells[:, 2]
 
 
 def _tints(cloud: Cloud) -> NDArray[np.int64]:
@@ -177,7 +177,7 @@ def _with_fields(cloud: Cloud, source: NDArray[np.generic], shown: Shown, after:
     count = len(cloud)
     fields = {"shown": np.full(count, shown, dtype=np.uint8), "source": np.asarray(source).astype(np.uint8)}
     fields["near"] = np.ones(count, dtype=np.uint8)
-    for name, kind, absent in (("evidence", np.uint8, UNKNOWN), ("deviation", np.float32, np.nan)):
+    for name, kind, absent in (("evidence", np.uint8, REMOVED), ("deviation", np.float32, np.nan)):
         if name in after.fields:
             fields[name] = np.asarray(cloud.fields.get(name, np.full(count, absent))).astype(kind)
     return replace(cloud, fields=fields)
@@ -223,7 +223,7 @@ def encode(view: View) -> tuple[dict[str, Any], bytes]:
     cells = np.rint((cloud.points - low) / step).astype(np.int64)
     shown = cloud.fields["shown"]
     # What is shown before, then both, then after: each picture is one run of points.
-    order = np.lexsort((_curve(cells), np.choose(shown, [1, 0, 2])))
+    order = np.lexsort((morton(cells), np.choose(shown, [1, 0, 2])))
     planes, about = _planes(cells[order], cloud[order])
     middle = (low + high) / 2
     about |= {
@@ -262,15 +262,6 @@ def _planes(cells: NDArray[np.int64], cloud: Cloud) -> tuple[dict[str, Bytes], d
         about["deviation"] = [float(end) for end in np.percentile(deviation[deviation > 0], [2, 98])]
         planes["deviation"] = _log_levels(deviation, *about["deviation"])
     return planes, about
-
-
-def _curve(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(N,) place of cells (N, 3) of 16 bits along the Morton curve."""
-    keys = np.zeros(len(cells), dtype=np.int64)
-    for bit in range(16):
-        for axis in range(3):
-            keys |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return keys
 
 
 def _difference_planes(name: str, column: NDArray[np.int64]) -> dict[str, Bytes]:

@@ -10,8 +10,8 @@ import pycolmap
 
 from scenefuse.core.stage import StageError, atomic_file, setting, threads
 from scenefuse.core.tables import read_lines
-from scenefuse.photos.cameras.colmap import camera_of
 from scenefuse.photos.cameras.posed_photo import at_size
+from scenefuse.photos.cameras.read_cameras import camera_of
 from scenefuse.photos.photos import Photo, check_unchanged, read_photos
 from scenefuse.sfm.colmap import cancellable
 

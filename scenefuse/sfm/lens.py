@@ -6,12 +6,11 @@ better with them; where they are not, they are held, and the photos say nothing 
 
 import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
-from scenefuse.core.stage import quantity
 from scenefuse.core.transforms import Array
 from scenefuse.sfm.colmap import MIN_PHOTOS, ROBUST_PX, ROUGH_TOLERANCE, Freedom, adjust
 
@@ -69,19 +68,11 @@ DISTORTED = (HELD, CENTRED, RADIAL, BROWN, RATIONAL)
 LENSES = {lens.name: lens for lens in (KNOWN, *DISTORTED)}
 
 
-@dataclass(frozen=True)
-class Choice:
-    """The lens that a model's photos determine.
-
-    Attributes:
-        lens: the choice.
-        next: the one beyond it, which they do not determine, or None.
-        trials: of every lens tried, what came out.
-    """
+class Choice(NamedTuple):
+    """The lens that a model's photos determine, and the one beyond it, which they do not, or None."""
 
     lens: Lens
     next: Lens | None
-    trials: list[dict[str, Any]]
 
 
 def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTORTED) -> Choice:
@@ -99,7 +90,6 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
     kept, held = hold_out(model)
     best, beyond = lenses[0], None
     poorer = [_errors(best.fit(kept, ROUGH_TOLERANCE), held)]
-    trials = [_trial(best, poorer[0], None, "the poorest")]
     for lens in lenses[1:]:
         if lens is RADIAL and any(camera.model_name not in ONE_TERM for camera in model.cameras.values()):
             continue
@@ -108,18 +98,18 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
         gain = min(_gain(others, errors) for others in poorer)
         median = min(np.median(others) for others in poorer) if held else 0.0
         better = len(errors) > 0 and np.median(errors) <= (1 - MIN_MEDIAN_GAIN) * median
-        problem = _problem(fitted, gain if better else 0.0)
-        trials.append(_trial(lens, errors, gain, problem or "predicts held-out observations better"))
-        if _in_bounds(fitted):
+        is_lens = _in_bounds(fitted)
+        if is_lens:
             poorer.append(errors)
-        if problem is None:
+        taken = better and gain >= MIN_GAIN and is_lens
+        if taken:
             best, beyond = lens, None
         elif beyond in (None, RADIAL):
             beyond = lens
         # A free principal point may help with distortion only, and one term of it with the others: all are tried.
-        if problem is not None and lens.richest not in (None, RADIAL.richest):
+        if not taken and lens.richest not in (None, RADIAL.richest):
             break
-    return Choice(best, beyond, trials)
+    return Choice(best, beyond)
 
 
 def hold_out(model: pycolmap.Reconstruction) -> tuple[pycolmap.Reconstruction, Held]:
@@ -150,18 +140,6 @@ def enrich(camera: pycolmap.Camera, name: str) -> None:
     camera.params = [*map(float, [*same, *centre, *distortion]), *[0.0] * missing]
 
 
-def describe_lens(choice: Choice, model: pycolmap.Reconstruction) -> dict[str, Any]:
-    """The choice as quantities: what is refined and why, and how far the principal point is from the middle."""
-    cameras = [c for _, c in sorted(model.cameras.items())]
-    off = [[c.principal_point_x - c.width / 2, c.principal_point_y - c.height / 2] for c in cameras]
-    return {
-        "lens": quantity(choice.lens.name, ""),
-        "next_lens": quantity(None if choice.next is None else choice.next.name, ""),
-        "lens_trials": quantity(choice.trials, ""),
-        "principal_point_off_centre": quantity(off, "px"),
-    }
-
-
 def _errors(model: pycolmap.Reconstruction, held: Held) -> Array:
     """(N,) reprojection errors in pixels at held-out observations, at most MAX_ERROR_PX; that, where there is none."""
     errors = np.full(len(held), MAX_ERROR_PX)
@@ -181,13 +159,6 @@ def _gain(poorer: Array, richer: Array) -> float:
     return float(smaller.mean() / max(smaller.std(ddof=1) / np.sqrt(len(smaller)), 1e-12))
 
 
-def _problem(model: pycolmap.Reconstruction, gain: float) -> str | None:
-    """Why a richer lens is not taken, or None."""
-    if gain < MIN_GAIN:
-        return "held-out observations are predicted no better"
-    return None if _in_bounds(model) else "the principal point ran away from the middle"
-
-
 def _in_bounds(model: pycolmap.Reconstruction) -> bool:
     """Whether all principal points are near enough to the middle to be a lens's."""
     for camera in model.cameras.values():
@@ -195,13 +166,3 @@ def _in_bounds(model: pycolmap.Reconstruction) -> bool:
         if np.abs(off).max() > MAX_OFF_CENTRE * max(camera.width, camera.height):
             return False
     return True
-
-
-def _trial(lens: Lens, errors: Array, gain: float | None, verdict: str) -> dict[str, Any]:
-    return {
-        "lens": lens.name,
-        "held_out_observations": len(errors),
-        "median_error_px": float(np.median(errors)) if len(errors) else None,
-        "gain_standard_errors": gain,
-        "verdict": verdict,
-    }

@@ -22,7 +22,7 @@ from scenefuse.core.stage import (
     threads,
     write_json,
 )
-from scenefuse.marks.lengths import read_lengths
+from scenefuse.marks.triangulation import read_lengths
 from scenefuse.photos.cameras.read_cameras import place_of
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.photos import orientations_in, read_photos
@@ -30,14 +30,16 @@ from scenefuse.sfm.colmap import (
     ITERATIONS,
     MIN_PHOTOS,
     ROUGH_TOLERANCE,
+    STRONG_PAIR,
     adjust,
     cancellable,
+    doubtful_photos,
     drop_outliers,
+    explained_matches,
     require_database,
 )
-from scenefuse.sfm.explained import STRONG_PAIR, doubtful_photos, explained_matches
 from scenefuse.sfm.given_cameras import triangulated
-from scenefuse.sfm.lens import DISTORTED, HELD, KNOWN, Choice, choose_lens, describe_lens
+from scenefuse.sfm.lens import DISTORTED, HELD, KNOWN, Lens, choose_lens
 
 # A second mapping that explains this share of the matches that the first explains is the better one: less is chance.
 MIN_EXPLAINED_AGAIN = 0.999
@@ -60,6 +62,25 @@ class MappingSettings:
 
     min_registered_share: float = setting(0.7, least=0, most=1)
     """Smallest share of the photos that have to be registered, 0 to 1; fewer is an error."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is mapped.
+
+    Attributes:
+        names: of the photos.
+        folder: that holds them.
+        database: with their verified matches.
+        sparse: where the model will be; files in between lie beside it.
+        share: smallest share of the photos that have to be registered.
+    """
+
+    names: list[str]
+    folder: Path
+    database: Path
+    sparse: Path
+    share: float
 
 
 def map_photos(
@@ -93,12 +114,11 @@ def map_photos(
         StageError: too small a share of the photos is registered; what `triangulated` and `read_lengths` say.
     """
     require_database(database)
-    names = [p.name for p in read_photos(photos)]
+    job = Job([p.name for p in read_photos(photos)], folder, database, sparse, settings.min_registered_share)
     if cameras is not None:
-        turned = orientations_in(read_json(photos))
-        model, content = _taken(cameras, folder, names, turned, database, sparse, settings, seed)
+        model, content = _taken(job, cameras, orientations_in(read_json(photos)), seed)
     else:
-        model, content = _mapped(names, folder, database, sparse, calibrated, settings, seed)
+        model, content = _mapped(job, calibrated, seed)
     content |= in_metres(model, lengths, original_sizes(read_json(photos)))
     with atomic_directory(sparse) as temporary:
         model.write(temporary)
@@ -126,15 +146,7 @@ def in_metres(
     }
 
 
-def _mapped(
-    names: list[str],
-    folder: Path,
-    database: Path,
-    sparse: Path,
-    calibrated: bool,
-    settings: MappingSettings,
-    seed: int,
-) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
+def _mapped(job: Job, calibrated: bool, seed: int) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
     """The model of photos by name, and what it is, as quantities: of a few attempts the one that explains most matches.
 
     One attempt is enough where no photo is doubtful. A further one that registers too few photos is left out.
@@ -142,13 +154,13 @@ def _mapped(
     attempts: list[tuple[int, pycolmap.Reconstruction, dict[str, Any]]] = []
     for attempt in range(ATTEMPTS):
         try:
-            model, content = _attempt(names, folder, database, sparse, calibrated, settings, seed + attempt)
+            model, content = _attempt(job, calibrated, seed + attempt)
         except StageError as error:
             if not attempts:
                 raise
             print(f"attempt {attempt + 1} of {ATTEMPTS} is left out: {error}", flush=True)
             continue
-        found = explained_matches(model, database)
+        found = explained_matches(model, job.database)
         doubtful = doubtful_photos(model, found)
         content["doubtful_photos"] = quantity(doubtful, "1")
         content["notes"] = quantity([_doubt(doubtful)] if doubtful else [], "")
@@ -160,35 +172,26 @@ def _mapped(
     return model, content | {"attempts": quantity(attempt + 1, "1")}
 
 
-def _attempt(
-    names: list[str],
-    folder: Path,
-    database: Path,
-    sparse: Path,
-    calibrated: bool,
-    settings: MappingSettings,
-    seed: int,
-) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
+def _attempt(job: Job, calibrated: bool, seed: int) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
     """The model that one seed gives, and what it is, as quantities."""
-    ranked, least_matches = _mapped_first(names, folder, database, sparse, calibrated, seed)
-    _check_registered(ranked, names, settings.min_registered_share)
-    before_px = ranked[0].compute_mean_reprojection_error()
+    ranked, least_matches = _mapped_first(job, calibrated, seed)
+    _check_registered(ranked, job)
     adjust(ranked[0], (KNOWN if calibrated else HELD).freedom, ROUGH_TOLERANCE)
     drop_outliers(ranked[0])
-    choice = choose_lens(ranked[0], (KNOWN,) if calibrated else DISTORTED)
-    model = choice.lens.fit(ranked[0])
+    lens, beyond = choose_lens(ranked[0], (KNOWN,) if calibrated else DISTORTED)
+    model = lens.fit(ranked[0])
     mappings = 1
-    if choice.lens not in (HELD, KNOWN):
-        again = _mapped_again(model, database, folder, sparse, _mapper_options(len(names), True, seed, least_matches))
-        second = choice.lens.fit(again[0]) if again else None
-        if second is not None and _explained(second, database) >= MIN_EXPLAINED_AGAIN * _explained(model, database):
+    if lens not in (HELD, KNOWN):
+        again = _mapped_again(model, job, _mapper_options(job, True, seed, least_matches))
+        second = lens.fit(again[0]) if again else None
+        if second is not None and _explained(second, job) >= MIN_EXPLAINED_AGAIN * _explained(model, job):
             ranked, model, mappings = again, second, 2
     drop_outliers(model)
-    summary = _describe(model, names) | describe_lens(choice, model)
+    summary = _describe(model, job.names, lens, beyond)
     print(
-        f"{summary['registered']['value']} of {len(names)} photos registered, "
+        f"{summary['registered']['value']} of {len(job.names)} photos registered, "
         f"{summary['mean_reprojection_error_px']['value']:.3f} px, {summary['points']['value']} points, "
-        f"{choice.lens.words}",
+        f"{lens.words}",
         flush=True,
     )
     left_out = [
@@ -202,33 +205,30 @@ def _attempt(
         print(f"note: a separate model of {len(entry['photos'])} photos is left out", flush=True)
     return model, {
         **summary,
-        "mean_reprojection_error_before_last_adjustment_px": quantity(before_px, "px"),
         "mappings": quantity(mappings, "1"),
         "least_matches_of_a_pair": quantity(least_matches, "1"),
         "models_left_out": quantity(left_out, ""),
     }
 
 
-def _mapped_first(
-    names: list[str], folder: Path, database: Path, sparse: Path, calibrated: bool, seed: int
-) -> tuple[list[pycolmap.Reconstruction], int]:
+def _mapped_first(job: Job, calibrated: bool, seed: int) -> tuple[list[pycolmap.Reconstruction], int]:
     """Models from strong pairs alone, or, where these explain more, from all that were verified; fewest matches used.
 
     Pairs that chance verified put photos in wrong places; but some photos have no other pairs.
     """
-    strong = _models(database, folder, sparse, _mapper_options(len(names), calibrated, seed, STRONG_PAIR))
-    if strong and strong[0].num_reg_images() == len(names):
+    strong = _models(job, _mapper_options(job, calibrated, seed, STRONG_PAIR))
+    if strong and strong[0].num_reg_images() == len(job.names):
         return strong, STRONG_PAIR
-    options = _mapper_options(len(names), calibrated, seed)
-    every = _models(database, folder, sparse, options)
-    if every and (not strong or _explained(every[0], database) > _explained(strong[0], database)):
+    options = _mapper_options(job, calibrated, seed)
+    every = _models(job, options)
+    if every and (not strong or _explained(every[0], job) > _explained(strong[0], job)):
         return every, options.min_num_matches
     return strong, STRONG_PAIR
 
 
-def _explained(model: pycolmap.Reconstruction, database: Path) -> int:
+def _explained(model: pycolmap.Reconstruction, job: Job) -> int:
     """Verified matches that a model explains."""
-    return explained_matches(model, database).total
+    return explained_matches(model, job.database).total
 
 
 def _doubt(doubtful: dict[str, float]) -> str:
@@ -238,62 +238,54 @@ def _doubt(doubtful: dict[str, float]) -> str:
 
 
 def _taken(
-    cameras: Path,
-    folder: Path,
-    names: list[str],
-    orientations: Mapping[str, int],
-    database: Path,
-    sparse: Path,
-    settings: MappingSettings,
-    seed: int,
+    job: Job, cameras: Path, orientations: Mapping[str, int], seed: int
 ) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
     """The same from given cameras."""
-    work, place = sparse.with_name(f"{sparse.name}-given"), place_of(cameras)
-    options = _mapper_options(len(names), True, seed)
-    model, turned = triangulated(cameras, folder, orientations, database, work, options)
-    _check_registered([model], names, settings.min_registered_share, given=cameras)
+    work, place = job.sparse.with_name(f"{job.sparse.name}-given"), place_of(cameras)
+    options = _mapper_options(job, True, seed)
+    model, turned = triangulated(cameras, job.folder, orientations, job.database, work, options)
+    _check_registered([model], job, given=cameras)
     drop_outliers(model)
-    summary = _describe(model, names) | describe_lens(Choice(KNOWN, None, []), model)
-    print(f"{summary['registered']['value']} of {len(names)} photos have a camera in {cameras}", flush=True)
+    summary = _describe(model, job.names, KNOWN)
+    print(f"{summary['registered']['value']} of {len(job.names)} photos have a camera in {cameras}", flush=True)
     notes = [f"cameras are those of {cameras.name}, held", *turned]
     on_earth = {} if place is None else place.report()
     return model, summary | on_earth | {"models_left_out": quantity([], ""), "notes": quantity(notes, "")}
 
 
 def _models(
-    database: Path, folder: Path, sparse: Path, options: pycolmap.IncrementalPipelineOptions
+    job: Job, options: pycolmap.IncrementalPipelineOptions, database: Path | None = None
 ) -> list[pycolmap.Reconstruction]:
     """The models of incremental mapping, that with most photos first."""
     pycolmap.set_random_seed(options.random_seed)
-    with scratch_directory(sparse.with_name(f"{sparse.name}-models")) as work:
-        models = cancellable(pycolmap.incremental_mapping, database, folder, work, options=options)
+    with scratch_directory(job.sparse.with_name(f"{job.sparse.name}-models")) as work:
+        models = cancellable(pycolmap.incremental_mapping, database or job.database, job.folder, work, options=options)
     return sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
 
 
 def _mapped_again(
-    model: pycolmap.Reconstruction,
-    database: Path,
-    folder: Path,
-    sparse: Path,
-    options: pycolmap.IncrementalPipelineOptions,
+    model: pycolmap.Reconstruction, job: Job, options: pycolmap.IncrementalPipelineOptions
 ) -> list[pycolmap.Reconstruction]:
     """The models of another mapping that begins with the calibration of this one.
 
     A photo that the wrong lens put at a wrong place stays there in an adjustment; a new mapping puts it right.
     """
-    with scratch_directory(sparse.with_name(f"{sparse.name}-calibrated")) as work:
+    with scratch_directory(job.sparse.with_name(f"{job.sparse.name}-calibrated")) as work:
         calibrated = work / "database.db"
-        shutil.copyfile(database, calibrated)
+        shutil.copyfile(job.database, calibrated)
         with pycolmap.Database.open(calibrated) as opened:
             for camera in model.cameras.values():
                 known = pycolmap.Camera(camera.todict())
                 known.has_prior_focal_length = True
                 opened.update_camera(known)
-        return _models(calibrated, folder, sparse, options)
+        return _models(job, options, calibrated)
 
 
-def _describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any]:
-    """What a model holds, as quantities: photos registered, errors, points, cameras, photos left out."""
+def _describe(
+    model: pycolmap.Reconstruction, names: list[str], lens: Lens, beyond: Lens | None = None
+) -> dict[str, Any]:
+    """What a model holds, as quantities: photos registered, errors, points, cameras, lens and the one beyond it, photos
+    left out."""
     registered = _registered_names(model)
     cameras = [
         {"model": c.model_name, "width": c.width, "height": c.height, "params": list(c.params)}
@@ -305,14 +297,15 @@ def _describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any
         "registered_share": quantity(len(registered) / len(names), "1"),
         "mean_reprojection_error_px": quantity(model.compute_mean_reprojection_error(), "px"),
         "points": quantity(model.num_points3D(), "1"),
-        "mean_track_length": quantity(model.compute_mean_track_length(), "1"),
         "not_registered": quantity(sorted(set(names) - registered), ""),
         "cameras": quantity(cameras, "px"),
+        "lens": quantity(lens.name, ""),
+        "next_lens": quantity(beyond and beyond.name, ""),
     }
 
 
 def _mapper_options(
-    photos: int, calibrated: bool, seed: int, least_matches: int | None = None
+    job: Job, calibrated: bool, seed: int, least_matches: int | None = None
 ) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.min_num_matches = least_matches or options.min_num_matches
@@ -329,25 +322,23 @@ def _mapper_options(
         options.max_extra_param = np.inf
     # A second attempt from another pair stops, by default, once it shares twenty photos with the first, however small
     # that one stayed; here every attempt goes on as far as it can, and the largest is taken.
-    options.max_model_overlap = photos
+    options.max_model_overlap = len(job.names)
     return options
 
 
-def _check_registered(
-    models: list[pycolmap.Reconstruction], names: list[str], share: float, given: Path | None = None
-) -> None:
+def _check_registered(models: list[pycolmap.Reconstruction], job: Job, given: Path | None = None) -> None:
     """StageError when the largest model, or that of the given cameras, holds too few of the photos."""
     count = models[0].num_reg_images() if models else 0
-    if count >= MIN_PHOTOS and count >= share * len(names):
+    if count >= MIN_PHOTOS and count >= job.share * len(job.names):
         return
     others = f" (and {len(models) - 1} separate smaller models)" if len(models) > 1 else ""
-    missing = sorted(set(names) - (_registered_names(models[0]) if models else set()))
+    missing = sorted(set(job.names) - (_registered_names(models[0]) if models else set()))
     some = f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
-    what = f"only {count} of {len(names)} photos " + (
+    what = f"only {count} of {len(job.names)} photos " + (
         f"have a camera in {given}" if given else f"were registered{others}"
     )
     raise StageError(
-        f"{what}, fewer than the share of {share:g} that min_registered_share requires; without one: {some}. "
+        f"{what}, fewer than the share of {job.share:g} that min_registered_share requires; without one: {some}. "
         + (GIVEN_ADVICE if given else MAPPING_ADVICE)
     )
 

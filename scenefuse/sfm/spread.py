@@ -75,26 +75,23 @@ def estimate_spread(*, sparse: Path, sparse_json: Path, spread: Path, report: Pa
         sparse: COLMAP model.
         sparse_json: JSON of the mapping stage, for the lens.
         spread: output, NPZ of a `Spread`, in the model's frame.
-        report: output, JSON: number of models and points, standard deviations of the calibration.
+        report: output, JSON: number of models and points.
     """
     known = read_json(sparse_json)
     model = read_model(sparse)
     beyond = value(known, "next_lens")
-    found, calibrations = spread_of(model, LENSES[value(known, "lens")], None if beyond is None else LENSES[beyond])
+    found = spread_of(model, LENSES[value(known, "lens")], None if beyond is None else LENSES[beyond])
     write_spread(spread, found)
     content = {
         "models": quantity(len(found.whole), "1"),
         "points": quantity(len(found.points), "1"),
-        "calibration_sd": quantity(calibrations, "px"),
     }
     write_json(report, content)
     print(f"{len(found.whole)} models, {len(found.points)} points", flush=True)
 
 
-def spread_of(
-    model: pycolmap.Reconstruction, lens: Lens, beyond: Lens | None
-) -> tuple[Spread, list[dict[str, float | None]]]:
-    """The ensemble of a model, and the jackknife's standard deviations of each camera's parameters.
+def spread_of(model: pycolmap.Reconstruction, lens: Lens, beyond: Lens | None) -> Spread:
+    """The ensemble of a model.
 
     Args:
         model: bundle-adjusted with `lens`; it is not changed.
@@ -105,7 +102,7 @@ def spread_of(
     points = np.array([model.points3D[p].xyz for p in ids]).reshape(-1, 3)
     names = sorted((model.images[i].name, i) for i in model.reg_image_ids())
     groups = min(GROUPS, len(names)) if len(names) > MIN_PHOTOS else 0
-    moved, whole, parameters = [], [], []
+    moved, whole = [], []
     for group in range(groups):
         fewer = copy.deepcopy(model)
         for _, image in names[group::groups]:
@@ -114,12 +111,11 @@ def spread_of(
         if (found := _moved(fewer, model, ids)) is not None:
             moved.append(found)
             whole.append(False)
-        parameters.append([camera.params for _, camera in sorted(fewer.cameras.items())])
     if beyond is not None and (found := _moved(beyond.fit(model, ROUGH_TOLERANCE), model, ids)) is not None:
         moved.append(found)
         whole.append(True)
     kept = np.array(moved).reshape(-1, len(ids), 3)
-    return Spread(points, kept, np.array(whole, dtype=bool)), _calibration_sd(model, parameters)
+    return Spread(points, kept, np.array(whole, dtype=bool))
 
 
 def write_spread(path: Path, spread: Spread) -> None:
@@ -163,15 +159,3 @@ def _common_motion(before: Array, after: Array) -> Sim3:
     error = np.linalg.norm(motion.apply(before) - after, axis=1)
     good = error <= MAX_ERROR_MEDIANS * np.median(error)
     return fit_sim3(before[good], after[good]) if good.sum() >= MIN_PHOTOS else motion
-
-
-def _calibration_sd(model: pycolmap.Reconstruction, parameters: list[list[Array]]) -> list[dict[str, float | None]]:
-    """The jackknife's standard deviation of every parameter of each camera, by its name."""
-    found = []
-    for row, (_, camera) in enumerate(sorted(model.cameras.items())):
-        names = [name.strip() for name in camera.params_info.split(",")]
-        drawn = np.array([trial[row] for trial in parameters])
-        if len(drawn):
-            sd = np.sqrt((len(drawn) - 1) / len(drawn) * ((drawn - drawn.mean(0)) ** 2).sum(0))
-            found.append(dict(zip(names, sd.tolist())))
-    return found

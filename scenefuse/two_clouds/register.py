@@ -10,11 +10,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from scenefuse.cloud.cloud_file import CloudFile
+from scenefuse.cloud.cloud_file import CloudFile, without_strays
 from scenefuse.cloud.clouds import Cloud, has_unit_normals, write_cloud
 from scenefuse.cloud.import_cloud import unit_and_name
 from scenefuse.cloud.readers.las import las_crs
-from scenefuse.cloud.strays import without_strays
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.settings import ROOT
 from scenefuse.core.stage import StageError, atomic_file, quantity, value, write_json

@@ -37,9 +37,8 @@ from scenefuse.metrics.evaluate_object import (
     scene_scores,
     surface_to_find,
 )
-from scenefuse.metrics.scores import THRESHOLDS
 from scenefuse.metrics.true_cameras import read_cameras
-from scenefuse.metrics.truth import registration_error
+from scenefuse.metrics.truth import THRESHOLDS, registration_error
 from scenefuse.photos.workspace import read_workspace
 from scenefuse.register.uncertainty import Uncertainty
 

@@ -24,14 +24,15 @@ from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.metrics.evaluate_scene import within
-from scenefuse.metrics.scores import f_score, nearest
 from scenefuse.metrics.true_cameras import read_cameras, visible
 from scenefuse.metrics.truth import (
     HIDDEN,
     belongs_to_object,
     cast_together,
     distances,
+    f_score,
     fit_cameras,
+    nearest,
     read_mesh,
     read_posed,
     sample_surface,

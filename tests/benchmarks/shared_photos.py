@@ -33,7 +33,7 @@ def one(seed: int, bend: float) -> dict[str, Any]:
     """A trial: mapped, aligned, compared with the truth."""
     start, plan = time.perf_counter(), drawn(seed, bend)
     trial, choices = modelled(seed, plan)
-    spreads = [spread_of(s.model, c.lens, c.next)[0] for s, c in zip((trial.obj, trial.scene), choices)]
+    spreads = [spread_of(s.model, c.lens, c.next) for s, c in zip((trial.obj, trial.scene), choices)]
     planted = time.perf_counter()
     content = align_landmarks(trial.obj.landmarks(), trial.scene.landmarks(), AlignmentSettings(), seed)
     aligned, known = time.perf_counter(), truth(trial)

@@ -13,7 +13,7 @@ from support.browser import chromium
 from support.clicking_page import LOCAL, MASK, Page, served
 from support.user_project import Project
 
-from scenefuse.marks.lengths import read_ends
+from scenefuse.marks.triangulation import read_ends
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.pick.photo_tiles import Picture
 

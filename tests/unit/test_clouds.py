@@ -4,8 +4,8 @@ import laspy
 import numpy as np
 import pytest
 
+from scenefuse.cloud.cloud_file import strays
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud
-from scenefuse.cloud.strays import strays
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3

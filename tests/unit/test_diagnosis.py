@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scenefuse.core.transforms import look_at
-from scenefuse.report.diagnosis import diagnose, named
+from scenefuse.report.facts import diagnose, named
 from scenefuse.report.run_summary import ObjectSummary
 from scenefuse.sfm.undistort import largest_gap
 

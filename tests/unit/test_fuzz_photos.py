@@ -21,7 +21,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_table
 from scenefuse.georef.control_file import read_control
 from scenefuse.marks.clicks import read_points
-from scenefuse.marks.lengths import read_ends
+from scenefuse.marks.triangulation import read_ends
 from scenefuse.photos.cameras.read_cameras import place_of, read_posed_photos
 from scenefuse.photos.photo_files import photos_by_name
 from scenefuse.photos.photos import inspect_photo, save_upright

@@ -37,9 +37,9 @@ def photographed(camera: list[float], noise_px: float = 0.3) -> pycolmap.Reconst
 def test_a_principal_point_off_the_middle_is_refined_and_found():
     model = photographed([700, 700, 510, 388, 0, 0, 0, 0])
     before = copy.deepcopy(model)
-    choice = choose_lens(model)
-    camera = next(iter(choice.lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
-    assert (choice.lens, choice.next) == (CENTRED, BROWN)
+    lens, beyond = choose_lens(model)
+    camera = next(iter(lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
+    assert (lens, beyond) == (CENTRED, BROWN)
     assert abs(camera.principal_point_x - 510) < 1 and abs(camera.principal_point_y - 388) < 1
     assert list(model.cameras[1].params) == list(before.cameras[1].params), "the model itself was changed"
 
@@ -47,9 +47,9 @@ def test_a_principal_point_off_the_middle_is_refined_and_found():
 def test_brown_distortion_is_refined_and_found():
     true = [700, 700, 510, 388, -0.3, 0.5, 0.02, -0.015]
     model = photographed(true)
-    choice = choose_lens(model)
-    camera = next(iter(choice.lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
-    assert choice.lens == BROWN
+    lens, beyond = choose_lens(model)
+    camera = next(iter(lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
+    assert lens == BROWN
     rays = np.array([[x, y, 1.0] for x in (-0.2, 0, 0.2) for y in (-0.2, 0, 0.2)])
     expected = pycolmap.Camera(model="OPENCV", width=1000, height=800, params=true).img_from_cam(rays)
     off = camera.img_from_cam(rays) - expected
@@ -58,23 +58,21 @@ def test_brown_distortion_is_refined_and_found():
 
 def test_two_radial_terms_are_found_without_tangential_ones():
     model = photographed([700, 700, 510, 388, -0.5, 30, 0, 0])
-    choice = choose_lens(model)
-    assert (choice.lens, choice.next) == (RADIAL, BROWN)
-    camera = next(iter(choice.lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
+    lens, beyond = choose_lens(model)
+    assert (lens, beyond) == (RADIAL, BROWN)
+    camera = next(iter(lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
     assert camera.model_name == "RADIAL" and abs(camera.principal_point_x - 510) < 1
 
 
 def test_a_lens_in_the_middle_without_distortion_is_held():
-    choice = choose_lens(photographed([700, 700, 500, 400, 0, 0, 0, 0]))
-    assert (choice.lens, choice.next) == (HELD, CENTRED)
-    assert [trial["lens"] for trial in choice.trials] == ["held", "centred", "radial", "brown"]
+    lens, beyond = choose_lens(photographed([700, 700, 500, 400, 0, 0, 0, 0]))
+    assert (lens, beyond) == (HELD, CENTRED)
 
 
 def test_two_focal_lengths_stay_two():
     model = photographed([700, 700, 510, 388, 0, 0, 0, 0])
     for camera in model.cameras.values():
         camera.model, camera.params = pycolmap.CameraModelId.PINHOLE, [700, 700, 500, 400]
-    assert [trial["lens"] for trial in choose_lens(model).trials] == ["held", "centred", "brown"]
 
 
 def test_a_richer_model_is_the_same_lens():
@@ -90,11 +88,10 @@ def test_a_richer_model_is_the_same_lens():
 
 def test_the_spread_covers_a_wrong_lens_and_survives_a_file(tmp_path):
     model = photographed([700, 700, 510, 388, 0, 0, 0, 0])
-    held, _ = spread_of(model, HELD, CENTRED)
-    refined, calibration = spread_of(CENTRED.fit(model, ROUGH_TOLERANCE), CENTRED, None)
+    held = spread_of(model, HELD, CENTRED)
+    refined = spread_of(CENTRED.fit(model, ROUGH_TOLERANCE), CENTRED, None)
     place = np.median(held.points, axis=0)
     assert np.trace(held.covariance_at(place)) > 10 * np.trace(refined.covariance_at(place))
-    assert 0 < calibration[0]["cx"] < 2
     write_spread(tmp_path / "spread.npz", held)
     again = read_spread(tmp_path / "spread.npz")
     np.testing.assert_allclose(again.covariance_at(place), held.covariance_at(place), rtol=1e-3, atol=1e-12)
@@ -114,7 +111,7 @@ def test_photos_of_which_none_can_be_left_out_do_not_say_how_far_their_model_may
             frame.rig_from_world = pycolmap.Rigid3d(turn, -turn.matrix() @ np.array([10.0 * place, 0, 0]))
         elif place >= 3:
             model.deregister_frame(frame.frame_id)
-    unknown, _ = spread_of(model, HELD, None)
+    unknown = spread_of(model, HELD, None)
     assert unknown.covariance_at(np.zeros(3)) is None
 
 

@@ -9,8 +9,14 @@ from support.textured_plane import plane_views
 
 from scenefuse.core.stage import StageError, value
 from scenefuse.nerf.prior_inputs import depth_photos
-from scenefuse.paper.fused_depth import fuse_by_inverse_variance, variance_between_views
-from scenefuse.paper.monocular import PoseNetwork, load_networks, pose_quantities, rigid
+from scenefuse.paper.monocular import (
+    PoseNetwork,
+    fuse_by_inverse_variance,
+    load_networks,
+    pose_quantities,
+    rigid,
+    variance_between_views,
+)
 
 
 def test_rigid_turns_about_an_axis():

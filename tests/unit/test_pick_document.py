@@ -6,7 +6,7 @@ import pytest
 
 from scenefuse.core.stage import StageError
 from scenefuse.marks.clicks import Click, read_points
-from scenefuse.marks.lengths import read_ends
+from scenefuse.marks.triangulation import read_ends
 from scenefuse.pick.document import Document
 from scenefuse.pick.edits import with_length, with_point
 

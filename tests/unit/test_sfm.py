@@ -15,8 +15,7 @@ from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo, list_photos, read_photos, write_photos
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm import mapping
-from scenefuse.sfm.colmap import cancellable, require_database
-from scenefuse.sfm.explained import doubtful_photos, explained_matches
+from scenefuse.sfm.colmap import cancellable, doubtful_photos, explained_matches, require_database
 from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
 from scenefuse.sfm.mapping import MappingSettings, map_photos
 from scenefuse.sfm.matches import (

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, spacing
 from scenefuse.core.stage import StageError
-from scenefuse.report.view import REMOVED, UNKNOWN, Shown, View, encode, merge, read_view, thin, within, write_view
+from scenefuse.report.view import REMOVED, Shown, View, encode, merge, read_view, thin, within, write_view
 
 
 def square(count, seed=0, height=0.0, color=(90, 160, 70), **fields):
@@ -67,7 +67,7 @@ def test_fields_of_the_completed_cloud_are_kept_and_unknown_where_only_the_scene
     view = merge(before, after)
     gone = view.fields["shown"] == Shown.BEFORE
     assert gone.sum() == 10
-    assert (view.fields["evidence"][gone] == UNKNOWN).all() and (view.fields["evidence"][~gone] == 1).all()
+    assert (view.fields["evidence"][gone] == REMOVED).all() and (view.fields["evidence"][~gone] == 1).all()
     assert np.isnan(view.fields["deviation"][gone]).all()
     assert set(merge(before, before).fields) == {"shown", "source", "near"}
 

@@ -10,7 +10,6 @@ from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.photos.pictures import write_depth
-from scenefuse.photos.sheets import save_png
 from scenefuse.photos.workspace import read_views
 from scenefuse.report.figures import FigureInputs, draw_lone_object, draw_object
 from scenefuse.report.page import view_section
@@ -147,12 +146,6 @@ def test_discs_lie_in_the_surface():
     assert (facing.min(2) < 250).sum() == pytest.approx(covered[0], rel=0.3)
 
 
-def test_noise_is_saved_below_a_megabyte(tmp_path):
-    image = np.random.default_rng(0).integers(0, 255, (800, 900, 3), dtype=np.uint8)
-    save_png(tmp_path / "noise.png", image)
-    assert (tmp_path / "noise.png").stat().st_size < 1_000_000
-
-
 def box_surface(count, seed):
     """Points on the surface of a box 2 x 1 x 1 that stands on z = 0, coloured by side."""
     rng = np.random.default_rng(seed)
@@ -270,7 +263,6 @@ def test_figures_show_what_was_added(figures):
         "after.png",
     }
     assert {p.name for p in figures.iterdir()} == names | {"view.ply", "view.json"}
-    assert all(p.stat().st_size < 1_000_000 for p in figures.iterdir())
     before, after = (cv2.imread(str(figures / f"{n}.png")).astype(float) for n in ("before", "after"))
     assert (np.abs(before - after).max(2) > 40).mean() > 0.02
     colors = cv2.cvtColor(cv2.imread(str(figures / "missing.png")), cv2.COLOR_BGR2RGB).astype(int)
