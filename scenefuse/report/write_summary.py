@@ -13,12 +13,7 @@ from scenefuse.core.stage import atomic_file
 from scenefuse.core.version import VERSION
 from scenefuse.report.facts import object_facts, scene_facts
 from scenefuse.report.forecast import FORECAST, read_forecast
-from scenefuse.report.run_summary import (
-    ObjectSummary,
-    RunInputs,
-    RunSummary,
-    summarise,
-)
+from scenefuse.report.run_summary import ObjectSummary, RunInputs, RunSummary, summarise
 from scenefuse.report.tables import (
     QUANTITIES,
     completion_table,
