@@ -27,8 +27,15 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array
-from scenefuse.georef.control import Control, LocatedPoint, locate_points, read_control_points, seen_at
-from scenefuse.georef.control_file import ControlFile, SurveyedPoint
+from scenefuse.georef.control import (
+    Control,
+    ControlFile,
+    LocatedPoint,
+    SurveyedPoint,
+    locate_points,
+    read_control_points,
+    seen_at,
+)
 from scenefuse.georef.georeference import adjust_georeferenced, camera_poses, georeference, gps_cameras
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.georef.residuals import rms

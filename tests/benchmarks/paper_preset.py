@@ -6,11 +6,11 @@ snakemake --configfile config/paper.yaml --config "object={stage1: {pose_source:
     --cores 2
 python tests/benchmarks/paper_preset.py --shipped results --chained paper/results --from-sfm paper_from_sfm/results
 
-Its rows of the paper's Tables 2 to 4 are those of results/summary/paper.tsv (scenefuse/paper/paper_tables.py); here
-are two runs of the preset side by side, and errors against the truth. Where a stage ended in an error, the table says
-so, and what follows is empty; without a truth, so are errors. `null` is what chance gives: one motion, a random one,
-from each frame to the next, depth that is the same all over a photo, a random
-cloud in the place of the object's points, in the shipped run's crop or, for a run of the preset, in its own.
+Its rows of the paper's Tables 2 to 4 are those of results/summary/paper.tsv (scenefuse/paper/compare_with_paper.py);
+here are two runs of the preset side by side, and errors against the truth. Where a stage ended in an error, the table
+says so, and what follows is empty; without a truth, so are errors. `null` is what chance gives: one motion, a random
+one, from each frame to the next, depth that is the same all over a photo, a random cloud in the place of the object's
+points, in the shipped run's crop or, for a run of the preset, in its own.
 """
 
 from itertools import pairwise
@@ -28,8 +28,7 @@ from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.metrics.evaluate_object import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import SAMPLES, registration_error, true_depth
-from scenefuse.paper.estimate_as_paper import trajectory_error
-from scenefuse.paper.paper_tables import (
+from scenefuse.paper.compare_with_paper import (
     COMMON,
     NULL,
     OBJECTS,
@@ -40,6 +39,7 @@ from scenefuse.paper.paper_tables import (
     null_of,
     published,
 )
+from scenefuse.paper.estimate_as_paper import trajectory_error
 from scenefuse.photos.workspace import read_workspace
 from scenefuse.report.run_summary import ObjectSummary, summarise_object
 

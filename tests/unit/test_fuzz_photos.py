@@ -19,7 +19,7 @@ from PIL import Image, TiffImagePlugin
 from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_table
-from scenefuse.georef.control_file import read_control
+from scenefuse.georef.control import read_control
 from scenefuse.marks.clicks import read_points
 from scenefuse.marks.triangulation import read_ends
 from scenefuse.photos.cameras.read_cameras import place_of, read_posed_photos

@@ -12,8 +12,20 @@ from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.core.job_records import JobRecords
 from scenefuse.core.stage import quantity, value, write_json
 from scenefuse.core.transforms import Sim3, rotation_between
-from scenefuse.paper.compare_with_paper import ComparisonSettings, between_scenes, compare_with_paper, paper_section
-from scenefuse.paper.paper_tables import COMMON, HERE, NULL, OBJECTS, PAPER, PUBLISHED, SCENEFUSE, published
+from scenefuse.paper.compare_with_paper import (
+    COMMON,
+    HERE,
+    NULL,
+    OBJECTS,
+    PAPER,
+    PUBLISHED,
+    SCENEFUSE,
+    ComparisonSettings,
+    between_scenes,
+    compare_with_paper,
+    paper_section,
+    published,
+)
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.register.agreement import registration_metrics
 from scenefuse.report.run_summary import RunInputs

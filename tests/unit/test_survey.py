@@ -12,7 +12,7 @@ from PIL.ExifTags import IFD, Base
 from support.surveyed import FRAME, fly, gcp_lines, write_inputs
 
 from scenefuse.core.stage import StageError, read_json, value
-from scenefuse.georef.control_file import read_control
+from scenefuse.georef.control import read_control
 from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.photos.geodesy import scene_frame

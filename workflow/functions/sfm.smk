@@ -91,7 +91,7 @@ def check_survey(scene):
     if own and not made_here(row["photos"]):
         # Takes long to import, and most scenes have no survey.
         from scenefuse.photos.photos import photo_names
-        from scenefuse.georef.control_file import check_survey_files
+        from scenefuse.georef.control import check_survey_files
 
         try:
             check_survey_files(photo_names(Path(row["photos"])), **own)
@@ -216,7 +216,7 @@ def check_lengths(name):
     for file in own_file("object", name, "lengths"):
         if Path(photos).is_dir() and not made_here(file):
             from scenefuse.photos.photos import photo_names
-            from scenefuse.georef.control_file import check_survey_files
+            from scenefuse.georef.control import check_survey_files
 
             try:
                 names = [frame_name(photo) for photo in photo_names(Path(photos))]
