@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pyproj
+from pyproj.database import get_units_map
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
@@ -16,8 +17,6 @@ UTM = re.compile(r"WGS84 UTM (0?[1-9]|[1-5]\d|60)([NS])", re.IGNORECASE)
 MAX_BEYOND_DEG = 6.0
 # Coordinates this small are a site's own, unless the zero of their CRS lies where that is used.
 MAX_SITE_COORDINATE = 10_000.0
-# Units that GeoTIFF keys name by their EPSG codes, and their metres.
-LINEAR_UNITS = {9001: ("metre", 1.0), 9002: ("foot", 0.3048), 9003: ("US survey foot", 1200 / 3937)}
 # The feet of surveyors and of everybody else differ by less, which is a millimetre of a height.
 MAX_UNIT_RATIO = 1e-5
 
@@ -93,7 +92,8 @@ def registered(crs: pyproj.CRS) -> pyproj.CRS:
 def with_units(crs: pyproj.CRS, keys: dict[int, int]) -> pyproj.CRS:
     """A projected CRS in the units of GeoTIFF keys, and with the heights that these name (GeoTIFF 1.1, annex B)."""
     own = crs.axis_info[0].unit_conversion_factor
-    unit = LINEAR_UNITS.get(keys.get(3076, 0))
+    units = {unit.code: (unit.name, unit.conv_factor) for unit in get_units_map("EPSG", "linear").values()}
+    unit = units.get(str(keys.get(3076)))
     if unit is not None and abs(unit[1] / own - 1) > MAX_UNIT_RATIO:
         about = crs.to_json_dict()
         for axis in about["coordinate_system"]["axis"]:
@@ -104,7 +104,7 @@ def with_units(crs: pyproj.CRS, keys: dict[int, int]) -> pyproj.CRS:
     with suppress(pyproj.exceptions.CRSError):
         heights = pyproj.CRS.from_epsg(keys.get(4096, 0))
         factor = heights.axis_info[0].unit_conversion_factor
-    unit = LINEAR_UNITS.get(keys.get(4099, 0))
+    unit = units.get(str(keys.get(4099)))
     if unit is not None and abs(unit[1] / factor - 1) > MAX_UNIT_RATIO:
         name = "heights" if heights is None else f"{heights.name} in {unit[0]}"
         heights = pyproj.CRS.from_wkt(f'VERT_CS["{name}",VERT_DATUM["{name}",2005],UNIT["{unit[0]}",{unit[1]}]]')

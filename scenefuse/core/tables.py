@@ -42,7 +42,7 @@ def read_table(path: Path, key: str) -> dict[str, Row]:
             raise StageError(
                 f"{path}, row {number}: {len(row)} columns, and the header has {len(header)}; separate them by tabs"
             )
-        content = {name: _expanded(cell) for name, cell in zip(header, row)}
+        content = {n: str(Path(c).expanduser()) if c.startswith("~/") else c for n, c in zip(header, row)}
         if content[key] in rows:
             raise StageError(f"{path}: '{content[key]}' stands in two rows; names must differ")
         rows[content[key]] = content
@@ -85,11 +85,6 @@ def _cells(row: list[str]) -> list[str]:
     while cells and not cells[-1]:
         cells.pop()
     return cells
-
-
-def _expanded(cell: str) -> str:
-    """A cell, as a path where it begins with ~/."""
-    return str(Path(cell).expanduser()) if cell.startswith("~/") else cell
 
 
 def comma_advice(cells: list[str]) -> str:

@@ -16,7 +16,7 @@ from scenefuse.core.transforms import look_at
 from scenefuse.demo import bodies, textures
 from scenefuse.demo.bodies import Body, Exposure, draw_exposure, expose
 from scenefuse.demo.world import MAPPED, ORIGIN, SUN, World, build_world, openness
-from scenefuse.metrics.true_cameras import Cameras, cameras_json, pinhole
+from scenefuse.metrics.truth import Cameras, cameras_json, pinhole
 
 
 @dataclass(frozen=True)

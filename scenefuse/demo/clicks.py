@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.demo.world import build_world
-from scenefuse.metrics.true_cameras import read_cameras, visible
+from scenefuse.metrics.truth import read_cameras, visible
 from scenefuse.photos.pictures import read_mask
 
 # A point counts as hidden when something lies this far before it.

@@ -29,7 +29,7 @@ from scenefuse.georef.placement import (
 )
 from scenefuse.georef.residuals import Georeference, georeference_report, residuals_of, write_residuals
 from scenefuse.marks.triangulation import read_lengths
-from scenefuse.photos.cameras.place import Place, read_place
+from scenefuse.photos.cameras.given import Place, read_place
 from scenefuse.photos.geodesy import LocalFrame, local_frame
 from scenefuse.photos.photos import Photo, gps_accuracies, gps_positions, read_photos
 from scenefuse.photos.workspace import posed_images, read_model

@@ -18,7 +18,7 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.georef.on_cloud import FIT, check_fit, cloud_crs, fit_to_cameras, in_local, misfit
-from scenefuse.photos.cameras.place import read_place
+from scenefuse.photos.cameras.given import read_place
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
 from scenefuse.photos.workspace import View, read_model, read_views, with_mask
 

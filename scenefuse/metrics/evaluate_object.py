@@ -13,13 +13,12 @@ from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
 from scenefuse.fuse.write import after_fusion
 from scenefuse.geometry.visual_hull import mask_iou
-from scenefuse.metrics.true_cameras import Cameras, visible
-from scenefuse.metrics.true_cameras import read_cameras as read_true_cameras
 from scenefuse.metrics.truth import (
     HIDDEN,
     SAMPLES,
     THRESHOLDS,
     CameraFit,
+    Cameras,
     Mesh,
     Posed,
     belongs_to_object,
@@ -35,7 +34,9 @@ from scenefuse.metrics.truth import (
     sample_surface,
     scores_at,
     true_depth,
+    visible,
 )
+from scenefuse.metrics.truth import read_cameras as read_true_cameras
 from scenefuse.photos.pictures import read_depth, read_gray
 from scenefuse.photos.workspace import read_cameras, read_views
 from scenefuse.sfm.undistort import undistort_picture

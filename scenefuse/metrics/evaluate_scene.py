@@ -10,10 +10,10 @@ from scenefuse.cloud.clouds import sampled_rows
 from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.metrics.true_cameras import Cameras, read_cameras, visible
 from scenefuse.metrics.truth import (
     HIDDEN,
     SAMPLES,
+    Cameras,
     Mesh,
     Posed,
     camera_results,
@@ -22,9 +22,11 @@ from scenefuse.metrics.truth import (
     fit_cameras,
     nearest,
     print_results,
+    read_cameras,
     read_mesh,
     read_posed,
     sample_surface,
+    visible,
 )
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 

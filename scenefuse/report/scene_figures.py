@@ -87,7 +87,9 @@ def _scene_sheet(
     oblique = orbit_camera(np.concatenate([ground, centres]), -60.0, 30.0, size)
     rows: list[list[Cell]] = [[("from above", render(cloud, above, radii)), ("oblique", render(cloud, oblique, radii))]]
     if views:
-        counts = sum((_frames(view, cloud.points) for view in views), np.zeros(len(cloud), np.int64))
+        counts = np.zeros(len(cloud), np.int64)
+        for view in views:
+            counts[view.visible(cloud.points)[0]] += 1
         most = len(OVERLAP_COLORS) - 1
         overlap = render(cloud, above, radii, OVERLAP_COLORS[np.minimum(counts, most)])
         errors_below = render(cloud, above, radii, (215, 215, 215))
@@ -109,12 +111,6 @@ def _scene_sheet(
         sheet.axes[3].legend(loc="lower center", ncols=most + 1, handletextpad=0, columnspacing=0.6)
         _draw_errors(sheet.axes[2], above, {view.name: view.centre for view in views}, errors)
     return sheet
-
-
-def _frames(view: PhotoView, points: Array) -> NDArray[np.bool_]:
-    """(N,) whether a photo's frame holds points (N, 3), hidden ones too."""
-    pixels, depth = view.project(points)
-    return (depth > 0) & (pixels >= 0).all(1) & (pixels < [view.width, view.height]).all(1)
 
 
 def _draw_errors(axes: Any, camera: Camera, centres: dict[str, Array], errors: pd.DataFrame) -> None:

@@ -67,7 +67,11 @@ def write_report(
     body = [
         f"<header><h1>{escape(title)}</h1><p>{texts['intro']} Made by scenefuse {VERSION}.</p>",
         f"<nav>{links}</nav></header>",
-        *(_scene_facts(folder.name, of_scene[folder.name]) for folder in scenes if folder.name in of_scene),
+        *(
+            f'<section class="scene"><h2>Scene {escape(name)}</h2>{_facts(scene_facts(of_scene[name]))}</section>'
+            for name in (folder.name for folder in scenes)
+            if name in of_scene
+        ),
         *(_object_card(folder, row, views.get(folder / "figures"), texts) for folder, row in shown),
         *(_scene_card(folder, views.get(folder), texts) for folder in scenes if (folder / "scene.png").is_file()),
         '<section id="record"><h2>For the record</h2>',
@@ -102,11 +106,6 @@ def _facts(facts: dict[str, str]) -> str:
 def _folded(title: str, content: str, key: str) -> str:
     """What is shown when its title is pressed."""
     return f'<details id="{escape(key)}"><summary>{escape(title)}</summary>{content}</details>'
-
-
-def _scene_facts(name: str, row: Row) -> str:
-    """What is known of a scene before its objects."""
-    return f'<section class="scene"><h2>Scene {escape(name)}</h2>{_facts(scene_facts(row))}</section>'
 
 
 def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str:

@@ -10,7 +10,7 @@ import pycolmap
 
 from scenefuse.core.stage import StageError, atomic_file, setting, threads
 from scenefuse.core.tables import read_lines
-from scenefuse.photos.cameras.posed_photo import at_size
+from scenefuse.photos.cameras.given import at_size
 from scenefuse.photos.cameras.read_cameras import camera_of
 from scenefuse.photos.photos import Photo, check_unchanged, read_photos
 from scenefuse.sfm.colmap import cancellable
@@ -74,7 +74,8 @@ def extract_features(
                 extraction_options=options,
                 device=pycolmap.Device.cpu,
             )
-        counts = _feature_counts(temporary)
+        with pycolmap.Database.open(temporary) as opened:
+            counts = {i.name: opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()}
         missing = [p.name for p in listed if p.name not in counts]
         if missing:
             raise StageError(
@@ -141,8 +142,3 @@ def _reader_options(
     camera = at_size(known, (photo.width, photo.height), f"{photo.name}, upright as it is used,")
     numbers = ",".join(repr(float(number)) for number in camera.params)
     return pycolmap.ImageReaderOptions(camera_model=camera.model_name, camera_params=numbers)
-
-
-def _feature_counts(database: Path) -> dict[str, int]:
-    with pycolmap.Database.open(database) as opened:
-        return {i.name: opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()}

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from scenefuse.core.stage import StageError, scratch_directory
-from scenefuse.photos.cameras.posed_photo import PosedPhoto, at_size, possible_turns
+from scenefuse.photos.cameras.given import PosedPhoto, at_size, possible_turns
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
 from scenefuse.sfm.colmap import cancellable
 

@@ -15,8 +15,8 @@ from scipy import ndimage
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, write_json
 from scenefuse.core.transforms import Array
+from scenefuse.photos.cameras.given import PosedPhoto, at_size
 from scenefuse.photos.cameras.json_cameras import PERSPECTIVE
-from scenefuse.photos.cameras.posed_photo import PosedPhoto, at_size
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
 from scenefuse.photos.photo_files import frame_name, masks_by_name, pictures_below, stored_size
 from scenefuse.photos.photos import (

@@ -88,6 +88,8 @@ def match_features(
     choice, reason, pairs = choose_pairs(read_photos(photos), is_video, settings)
     print(f"{choice} pairs ({reason}): {len(pairs)}", flush=True)
     pycolmap.set_random_seed(seed)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
     with atomic_file(database) as temporary:
         shutil.copyfile(features, temporary)
         with _pair_list(temporary, pairs) as listed:
@@ -97,7 +99,7 @@ def match_features(
                 matching_options=_matching(settings),
                 # COLMAP looks at a cancellation only between two blocks of pairs.
                 pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=100),
-                verification_options=_verification(seed),
+                verification_options=verification,
                 device=pycolmap.Device.cpu,
             )
         with pycolmap.Database.open(temporary) as opened:
@@ -133,12 +135,6 @@ def _matching(settings: MatchSettings) -> pycolmap.FeatureMatchingOptions:
     options.sift.max_ratio = settings.max_ratio
     options.sift.max_distance = MAX_DISTANCE
     options.sift.cross_check = True
-    return options
-
-
-def _verification(seed: int) -> pycolmap.TwoViewGeometryOptions:
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
     return options
 
 

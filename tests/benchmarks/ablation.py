@@ -15,8 +15,7 @@ from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.core.settings import ROOT, build, read_settings
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
-from scenefuse.metrics.true_cameras import read_cameras
-from scenefuse.metrics.truth import fit_cameras, read_posed, registration_error
+from scenefuse.metrics.truth import fit_cameras, read_cameras, read_posed, registration_error
 from scenefuse.paper.register_as_paper import register_as_paper
 from scenefuse.register.agreement import AgreementSettings, registration_metrics
 from scenefuse.register.coarse import CoarseSettings, register_coarsely

@@ -37,8 +37,7 @@ from scenefuse.metrics.evaluate_object import (
     scene_scores,
     surface_to_find,
 )
-from scenefuse.metrics.true_cameras import read_cameras
-from scenefuse.metrics.truth import THRESHOLDS, registration_error
+from scenefuse.metrics.truth import THRESHOLDS, read_cameras, registration_error
 from scenefuse.photos.workspace import read_workspace
 from scenefuse.register.uncertainty import Uncertainty
 

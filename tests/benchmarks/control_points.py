@@ -41,8 +41,7 @@ from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.georef.residuals import rms
 from scenefuse.marks.clicks import Click
 from scenefuse.metrics.evaluate_scene import within
-from scenefuse.metrics.true_cameras import Cameras, read_cameras, visible
-from scenefuse.metrics.truth import HIDDEN, cast_together, read_mesh, sample_surface
+from scenefuse.metrics.truth import HIDDEN, Cameras, cast_together, read_cameras, read_mesh, sample_surface, visible
 from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo, list_photos, read_photos
 from scenefuse.photos.workspace import read_model

@@ -24,7 +24,6 @@ from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.metrics.evaluate_scene import within
-from scenefuse.metrics.true_cameras import read_cameras, visible
 from scenefuse.metrics.truth import (
     HIDDEN,
     belongs_to_object,
@@ -33,10 +32,12 @@ from scenefuse.metrics.truth import (
     f_score,
     fit_cameras,
     nearest,
+    read_cameras,
     read_mesh,
     read_posed,
     sample_surface,
     true_depth,
+    visible,
 )
 from scenefuse.photos.pictures import read_depth
 from scenefuse.photos.workspace import View, Workspace, read_workspace

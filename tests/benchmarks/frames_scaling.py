@@ -21,8 +21,7 @@ import pycolmap
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import quantity, run, write_json
 from scenefuse.demo.capture import OrbitSettings, render_object
-from scenefuse.metrics.true_cameras import Cameras, read_cameras, visible
-from scenefuse.metrics.truth import read_mesh, sample_surface
+from scenefuse.metrics.truth import Cameras, read_cameras, read_mesh, sample_surface, visible
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.refine_depth import refine_depth
 from scenefuse.nerf.train_depth import DepthTrainingSettings, train_depth

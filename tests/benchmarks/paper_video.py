@@ -24,7 +24,7 @@ from scenefuse.core.transforms import Array, fit_sim3, look_at
 from scenefuse.demo import bodies, textures
 from scenefuse.demo.capture import render
 from scenefuse.demo.world import World, build_world, openness
-from scenefuse.metrics.true_cameras import Cameras, pinhole
+from scenefuse.metrics.truth import Cameras, pinhole
 from scenefuse.nerf.prior_training import optimise, predict, prepare_torch
 from scenefuse.paper.estimate_as_paper import chained, trajectory_error
 from scenefuse.paper.monocular import (

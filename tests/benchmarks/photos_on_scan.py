@@ -28,7 +28,7 @@ from scenefuse.core.transforms import Array
 from scenefuse.demo.world import ORIGIN
 from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.placement import GeoreferenceSettings
-from scenefuse.metrics.true_cameras import read_cameras
+from scenefuse.metrics.truth import read_cameras
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.photos import read_photos, write_photos
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import quantity, write_json
 from scenefuse.core.transforms import Array, Sim3, box_corners, fit_sim3
-from scenefuse.photos.cameras.place import Place
+from scenefuse.photos.cameras.given import Place
 from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo, write_photos
 from scenefuse.photos.workspace import View

@@ -15,7 +15,7 @@ from scenefuse.demo import capture, clicks, textures
 from scenefuse.demo.bodies import DRONE, IDEAL, PHONE, Body, Exposure, blur_kernel, draw_exposure, expose, vignetting
 from scenefuse.demo.world import ORIGIN, World, build_world, openness
 from scenefuse.marks.clicks import read_points
-from scenefuse.metrics.true_cameras import Cameras, pinhole, read_cameras, visible
+from scenefuse.metrics.truth import Cameras, pinhole, read_cameras, visible
 from scenefuse.photos.geodesy import LocalFrame
 
 FLIGHT = capture.FlightSettings(

@@ -16,7 +16,7 @@ from support.surveyed import FOCAL, HEIGHT, WIDTH, fly
 
 from scenefuse.core.stage import StageError, quantity, read_json, value
 from scenefuse.georef.georeference import camera_poses
-from scenefuse.photos.cameras.posed_photo import PosedPhoto, stood_upright
+from scenefuse.photos.cameras.given import PosedPhoto, stood_upright
 from scenefuse.photos.cameras.read_cameras import place_of, read_posed_photos
 from scenefuse.photos.photos import write_photos
 from scenefuse.photos.workspace import View, write_model

@@ -24,8 +24,7 @@ from scenefuse.metrics.evaluate_object import (
     scene_scores,
 )
 from scenefuse.metrics.evaluate_scene import evaluate_scene
-from scenefuse.metrics.true_cameras import Cameras, cameras_json, pinhole
-from scenefuse.metrics.truth import f_score, scores_at
+from scenefuse.metrics.truth import Cameras, cameras_json, f_score, pinhole, scores_at
 from scenefuse.photos.pictures import read_gray, write_depth
 
 TRUTH_FROM_OBJECT = Sim3(

@@ -14,8 +14,7 @@ from scenefuse.cloud.crs import plane, read_crs
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines, read_text
 from scenefuse.core.transforms import Sim3
-from scenefuse.photos.cameras.place import Place, check_crs
-from scenefuse.photos.cameras.posed_photo import FLIP, GivenCamera, colmap_camera
+from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, check_crs, colmap_camera
 from scenefuse.photos.photo_files import COORDS, files_by_name, stored_size
 
 TRANSFORMS = {"transforms.json": "nerfstudio", "transforms_train.json": "Blender"}

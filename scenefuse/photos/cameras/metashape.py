@@ -12,8 +12,7 @@ from scenefuse.cloud.crs import usable
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_text
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.photos.cameras.place import Place, check_crs
-from scenefuse.photos.cameras.posed_photo import GivenCamera, colmap_camera
+from scenefuse.photos.cameras.given import GivenCamera, Place, check_crs, colmap_camera
 
 # Parameters of its lens; those that are zero are left out of the file.
 PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")

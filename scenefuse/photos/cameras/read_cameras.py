@@ -17,10 +17,9 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines, read_text
 from scenefuse.core.transforms import Array
+from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, PosedPhoto, colmap_camera
 from scenefuse.photos.cameras.json_cameras import TRANSFORMS, find_opensfm, opensfm_place, read_opensfm, read_transforms
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
-from scenefuse.photos.cameras.place import Place
-from scenefuse.photos.cameras.posed_photo import FLIP, GivenCamera, PosedPhoto, colmap_camera
 from scenefuse.photos.photo_files import BUNDLER, bundler_list, colmap_models, files_by_name, stored_size
 
 Found = TypeVar("Found")
@@ -198,7 +197,11 @@ def read_colmap(model: Path) -> list[GivenCamera]:
         ValueError, OSError, struct.error, KeyError: the files are damaged.
     """
     binary = (model / "images.bin").is_file()
-    cameras = _binary_cameras(model / "cameras.bin") if binary else _text_cameras(model / "cameras.txt")
+    cameras = (
+        _binary_cameras(model / "cameras.bin")
+        if binary
+        else {int(line.split()[0]): camera_of(line.split()) for _, line in read_lines(model / "cameras.txt")}
+    )
     images = _binary_images(model / "images.bin") if binary else _text_images(model / "images.txt")
     found = []
     for name, camera, (*turn, x, y, z) in images:
@@ -217,10 +220,6 @@ def camera_of(words: list[str]) -> pycolmap.Camera:
     if len(words) < 5:
         raise ValueError(f"{' '.join(words)} is no camera")
     return colmap_camera(words[1], float(words[2]), float(words[3]), [float(word) for word in words[4:]])
-
-
-def _text_cameras(file: Path) -> dict[int, pycolmap.Camera]:
-    return {int(line.split()[0]): camera_of(line.split()) for _, line in read_lines(file)}
 
 
 def _text_images(file: Path) -> list[Image]:
