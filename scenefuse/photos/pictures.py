@@ -66,7 +66,7 @@ def write_picture(path: Path, pixels: NDArray[np.uint8]) -> None:
         content = cv2.imencode(path.suffix, stored, options)[1]
     except cv2.error:
         raise StageError(f"{path} has an ending of no known picture; give .png or .jpg") from None
-    path.write_bytes(content)
+    path.write_bytes(content.tobytes())
 
 
 def _read(path: Path, flags: int) -> NDArray[Any]:

@@ -15,9 +15,9 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 from PIL import Image
+from pyproj.database import get_units_map
 
 from scenefuse.cloud.clouds import Cloud
-from scenefuse.cloud.crs import LINEAR_UNITS
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.transforms import Array
 from scenefuse.core.version import VERSION
@@ -243,7 +243,7 @@ def _linear(colors: NDArray[Any]) -> Array:
 
 def metres_per_unit(georeference_json: Path | None) -> float:
     """Metres in a unit of a scene; 1 where that is unknown."""
-    names = {name: metres for name, metres in LINEAR_UNITS.values()}
+    names = {unit.name: unit.conv_factor for unit in get_units_map("EPSG", "linear").values()}
     return names.get(length_unit(georeference_json), 1.0)
 
 
