@@ -22,33 +22,17 @@ from scenefuse.nerf.prior_training import Recipe, loss_quantities, optimise, pre
 from scenefuse.nerf.refine_depth import DepthPrior, read_stage_maps, write_prior
 from scenefuse.nerf.train_depth import align_maps
 from scenefuse.nerf.train_object_nerf import MIN_CONFIDENCE
-from scenefuse.paper.monocular import (
-    Content,
-    MonocularSettings,
-    Networks,
-    PoseNetwork,
-    Supervision,
-    blend_depths,
-    frames_of,
-    load_networks,
-    map_quantities,
-    monocular_losses,
-    new_monocular_networks,
-    pose_quantities,
-    recipe_of,
-    save_networks,
-    small_photos,
-    supervision_of,
-)
+from scenefuse.paper import monocular
+from scenefuse.paper.monocular import Content, MonocularSettings, Networks, Supervision
 from scenefuse.photos.views import Views, load_views
 from scenefuse.photos.workspace import read_workspace, write_model
 from scenefuse.sfm.gravity import estimate_up
 
 
 @torch.no_grad()
-def chained(network: PoseNetwork, frames: DepthPhotos) -> Array:
+def chained(network: monocular.PoseNetwork, frames: DepthPhotos) -> Array:
     """(V, 4, 4) poses in the frame of the first camera: the motions between consecutive frames one after the other."""
-    small = small_photos(frames)
+    small = monocular.small_photos(frames)
     motions: Tensor = network(small[:-1], small[1:])
     poses = [np.eye(4)]
     for next_from_this in motions.double().cpu().numpy():
@@ -185,10 +169,10 @@ def estimate_as_paper(
     """
     device = prepare_torch(seed)
     views = load_views(workspace, masks, settings.width_px, hold_out_every)
-    frames, networks = frames_of(views, device), new_monocular_networks(device)
+    frames, networks = monocular.frames_of(views, device), monocular.new_monocular_networks(device)
     content = few_frames(int(frames.trained.sum()))
     stage = Stage(workspace, outputs, checkpoints, views, frames, pose_source, seed)
-    stage.run(networks, supervision_of(frames), settings.epochs, content)
+    stage.run(networks, monocular.supervision_of(frames), settings.epochs, content)
 
 
 def few_frames(count: int) -> Content:
@@ -224,11 +208,11 @@ class Stage:
 
     def run(self, networks: Networks, supervision: Supervision, epochs: int, content: Content) -> None:
         """Train, and write depth maps, networks, poses and the report, with `content`."""
-        start, recipe = time.monotonic(), recipe_of(epochs)
+        start, recipe = time.monotonic(), monocular.recipe_of(epochs)
         print(f"{len(self.views.names)} frames, {recipe.steps(self.frames)} steps", flush=True)
         key = key_of("paper", recipe, self.seed, self.frames, supervision, networks.state())
         checkpoint = self.checkpoints / key / "state.pt"
-        objective = monocular_losses(networks, self.frames, supervision, recipe)
+        objective = monocular.monocular_losses(networks, self.frames, supervision, recipe)
         losses = optimise(networks.parts(), self.frames, objective, recipe, checkpoint, self.seed)
         raw = predict(networks.depth, self.frames, supervision.colors, supervision.first)
         placed = place(raw, networks, self.frames, self.views, self.pose_source)
@@ -236,7 +220,7 @@ class Stage:
         maps = depth[:, 0].cpu().numpy()
         with atomic_directory(self.outputs.stage) as folder:
             write_prior(folder, self.views, DepthPrior(maps, (maps > 0).astype(np.float32)))
-            save_networks(folder / "networks.pt", networks, maps.shape[2], placed.unit)
+            monocular.save_networks(folder / "networks.pt", networks, maps.shape[2], placed.unit)
         write_posed(self.workspace, self.outputs.posed, self.views, placed.poses)
         chain = chain_quantities(placed.chain, known, placed.poses, self.pose_source)
         write_json(self.outputs.posed_json, chain)
@@ -244,9 +228,9 @@ class Stage:
             "steps": quantity(recipe.steps(self.frames), "1"),
             **{name: part for name, part in chain.items() if name not in ("frame", "up_in_camera_frame")},
             "unit": quantity(placed.unit, "object units per unit of the networks"),
-            **map_quantities(depth, placed.measured),
+            **monocular.map_quantities(depth, placed.measured),
             **loss_quantities(losses),
-            **pose_quantities(networks.pose, self.frames, in_unit(known, placed.unit)),
+            **monocular.pose_quantities(networks.pose, self.frames, in_unit(known, placed.unit)),
             "seconds": quantity(round(time.monotonic() - start, 1), "s"),
         }
         write_json(self.outputs.report, content)
@@ -335,14 +319,14 @@ def refine_as_paper(
         StageError: stage 1's folder holds no networks, stage 2's no depth map of any photo, or as in stage 1.
     """
     device = prepare_torch(seed)
-    networks, width_px, unit = load_networks(earlier.previous / "networks.pt", device)
+    networks, width_px, unit = monocular.load_networks(earlier.previous / "networks.pt", device)
     views, used = (load_views(folder, masks, width_px, hold_out_every) for folder in (workspace, poses))
-    frames = frames_of(views, device)
-    blend = blend_depths(*_depths(earlier, views, device), photos_at(used.object_from_cam, views, frames))
+    frames = monocular.frames_of(views, device)
+    blend = monocular.blend_depths(*_depths(earlier, views, device), photos_at(used.object_from_cam, views, frames))
     print(f"accepted {blend.shares['accepted_share']:.0%} of the object's pixels", flush=True)
     content = {name: quantity(share, "1") for name, share in blend.shares.items()}
     stage = Stage(workspace, outputs, checkpoints, views, frames, pose_source, seed)
-    stage.run(networks, supervision_of(frames, blend.depth / unit, blend.weight), settings.epochs, content)
+    stage.run(networks, monocular.supervision_of(frames, blend.depth / unit, blend.weight), settings.epochs, content)
 
 
 def _depths(earlier: EarlierStages, views: Views, device: torch.device) -> tuple[Tensor, Tensor]:
