@@ -104,7 +104,7 @@ def match_features(
             )
         with pycolmap.Database.open(temporary) as opened:
             if settings.guided_matching:
-                error_px = _verification(seed).ransac.max_error
+                error_px = verification.ransac.max_error
                 match_guided(opened, error_px, settings.max_ratio, MAX_DISTANCE)
             _, per_pair = opened.read_two_view_geometry_num_inliers()
             median = int(np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()]))
