@@ -15,6 +15,7 @@ from scenefuse.core.transforms import UP, Array, Sim3
 from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole, without_strays
 from scenefuse.crop.one_photo import MAX_GROWTH, SceneClicks, crop_grown, locate_clicks
 from scenefuse.crop.vote import read_masked_views, vote
+from scenefuse.geometry.surface import SAMPLED_POINTS
 from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
 from scenefuse.marks.triangulation import locate
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
@@ -24,8 +25,6 @@ MIN_POINTS = 200
 MIN_FIDUCIALS = 4
 # Points of a scene in which an object is searched without any mark.
 MAX_WHOLE_POINTS = 10_000_000
-# Points of an object's own cloud that mark it.
-MAX_OWN_POINTS = 20_000
 
 
 @dataclass(frozen=True)
@@ -213,7 +212,7 @@ def crop_linked(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -
     if inputs.cloud is not None:
         mode, source, by = "cloud", inputs.cloud, "the object's own cloud"
         own = without_strays(read_cloud(inputs.cloud).points)
-        marks = pose.apply(own[:: max(1, len(own) // MAX_OWN_POINTS)])
+        marks = pose.apply(own[:: max(1, len(own) // SAMPLED_POINTS)])
         near = scene.near(*around_marks(marks, settings))[1]
     else:
         assert inputs.workspace is not None and inputs.masks is not None

@@ -20,17 +20,16 @@ from scenefuse.crop.crop_cloud import (
     crop_cloud,
     without_strays,
 )
+from scenefuse.geometry.depth_test import CELL_SPACINGS, SURFACE_SPACINGS
+from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
 from scenefuse.marks.clicks import Clicks
 from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
 from scenefuse.photos.workspace import View, read_views
 
-# A click has the depth of the points within this many spacings of the cloud around its ray; of points up to so many
-# spacings behind the nearest that is no stray: so many lie within these.
-RAY_SPACINGS, DEPTH_SPACINGS, MIN_NEIGHBOURS = 2, 8, 3
-# What a click outside lies on is flat where this many points around it have at most this surface variation; then it is
-# what lies as near to their plane as points of one part lie to each other.
-PLANE_POINTS, MAX_VARIATION = 8, 0.02
-# Inside clicks with a depth that span an object.
+# What a click outside lies on is flat where the points around it have at most this surface variation; then it is what
+# lies as near to their plane as points of one part lie to each other.
+MAX_VARIATION = 0.02
+# Inside clicks with a depth that span an object, and points that are no strays.
 MIN_INSIDE = 3
 # The object reaches at most so much farther than its clicks, as a ratio of diagonals: clicks are spread over the side
 # that the photo shows. What is larger is connected with something else.
@@ -72,7 +71,7 @@ class SceneClicks:
         extent = float(np.linalg.norm(np.ptp(self.inside, axis=0)))
         for k, click in enumerate(self.outside):
             own = (row == k) & (to_outside < to_inside)
-            around = points[np.argsort(np.linalg.norm(points - click, axis=1), kind="stable")[:PLANE_POINTS]]
+            around = points[np.argsort(np.linalg.norm(points - click, axis=1), kind="stable")[:NORMAL_NEIGHBOURS]]
             spread, axes = np.linalg.eigh(np.cov(around.T))
             if spread[0] < MAX_VARIATION * spread.sum():
                 own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < LINK_FRACTION * extent
@@ -126,7 +125,7 @@ def _behind(pixels: Array, scene: TiledCloud, step: float, view: View) -> Rows:
     corners = [np.where(end, scene.high, scene.low) for end in np.ndindex(2, 2, 2)]
     at, depth = view.project(np.concatenate(corners))
     at, depth = at.reshape(8, -1, 2), depth.reshape(8, -1)
-    reach = np.maximum(1.0, RAY_SPACINGS * step * float(view.intrinsics[0, 0]) / np.maximum(depth.min(0), step))
+    reach = np.maximum(1.0, CELL_SPACINGS * step * float(view.intrinsics[0, 0]) / np.maximum(depth.min(0), step))
     low, high = at.min(0) - reach[:, None], at.max(0) + reach[:, None]
     shown = ((pixels[:, None] >= low) & (pixels[:, None] <= high)).all(2).any(0)
     return np.flatnonzero((depth.max(0) > 0) & (shown | (depth.min(0) <= step)))
@@ -136,13 +135,13 @@ def _on_surface(points: Array, pixels: Array, depth: Array, pixel: Array, step: 
     """The middle (3,) of the nearest points (N, 3) that a photo shows about a pixel; None where there are none."""
     focal = float(view.intrinsics[0, 0])
     with np.errstate(divide="ignore"):
-        reach = np.maximum(1.0, RAY_SPACINGS * step * focal / depth)  # a pixel at least
+        reach = np.maximum(1.0, CELL_SPACINGS * step * focal / depth)  # a pixel at least
     rows = np.flatnonzero((depth > 0) & (np.abs(pixels - pixel).max(1) <= reach))
     if not len(rows):
         return None
     # A single point that floats before the surface does not say where it is.
-    ahead, thick = np.sort(depth[rows]), DEPTH_SPACINGS * step
-    crowd = np.searchsorted(ahead, ahead + thick, side="right") - np.arange(len(ahead)) >= MIN_NEIGHBOURS
+    ahead, thick = np.sort(depth[rows]), SURFACE_SPACINGS * step
+    crowd = np.searchsorted(ahead, ahead + thick, side="right") - np.arange(len(ahead)) >= MIN_INSIDE
     nearest = ahead[crowd.argmax()]
     front = rows[(depth[rows] >= nearest) & (depth[rows] <= nearest + thick)]
     return np.median(points[front], axis=0)

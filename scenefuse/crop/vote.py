@@ -12,15 +12,12 @@ from scenefuse.cloud.clouds import spacing
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop.crop_cloud import without_strays
-from scenefuse.geometry.depth_test import Where, depth_buffer, depth_test
+from scenefuse.geometry.depth_test import CELL_SPACINGS, SURFACE_SPACINGS, Where, depth_buffer, depth_test
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MAX_PHOTOS
 from scenefuse.geometry.visual_hull import least_framing
-from scenefuse.mvs.sparse_depths import MASK_REACH_PX
-from scenefuse.mvs.view_selection import MIN_SHARED_POINTS
+from scenefuse.mvs.sparse_depths import MASK_REACH_PX, MIN_SHARED_POINTS
 from scenefuse.photos.workspace import View, read_workspace, with_mask
 
-# A point is hidden by one of its cell, this many spacings wide, that is more than this many cells nearer.
-CELL_SPACINGS, HIDDEN_CELLS = 4, 2
 # Where the photos stand farther from the object than so many of its extents, what hides it there is not looked for.
 MAX_DISTANCE_EXTENTS = 4.0
 # How near one of the object's own SfM points must be, as a share of their extent.
@@ -148,11 +145,12 @@ def count(
     around = np.flatnonzero(framed >= least)
     if len(around) < 2:
         return framed, shown, inside
-    cell = CELL_SPACINGS * spacing(in_object[around])
+    step = spacing(in_object[around])
     for one in views:
         rows, pixels, _ = one.visible(in_object)
         near = in_object[rows]
-        unhidden = depth_test(near, depth_buffer(near, one, cell), HIDDEN_CELLS * cell) != Where.BEHIND
+        nearest = depth_buffer(near, one, 2 * CELL_SPACINGS * step)  # points of a scene lie unevenly
+        unhidden = depth_test(near, nearest, SURFACE_SPACINGS * step) != Where.BEHIND
         rows, pixels = rows[unhidden], pixels[unhidden]
         shown[rows] += 1
         inside[rows] += one.pixels[pixels[:, 1], pixels[:, 0]]

@@ -15,7 +15,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, spacing
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.measure import MIN_NEIGHBOURS, RESOLUTION, Measured
-from scenefuse.geometry.depth_test import see
+from scenefuse.geometry.depth_test import CELL_SPACINGS, see
 from scenefuse.photos.workspace import View
 
 Mask = NDArray[np.bool_]
@@ -37,7 +37,7 @@ REASONS = {
 MARGIN = RESOLUTION
 # Photos that must see through a point, and the share of those that it is open to: a surface that is wrong itself lies
 # behind good points in some photos; a point that is not there has surfaces behind it in many.
-THROUGH_PHOTOS, THROUGH_SHARE = 2, 0.3
+THROUGH_PHOTOS, THROUGH_SHARE = 2, 0.2
 # Points of both sides show the same place within so many of their common standard deviations, or so many spacings of
 # the sparser side where that is more; never farther than twice the RESOLUTION.
 SAME_PLACE_DEVIATIONS, SAME_PLACE_SPACINGS = 5.0, 1.5
@@ -46,10 +46,6 @@ SAME_PLACE_DEVIATIONS, SAME_PLACE_SPACINGS = 5.0, 1.5
 BETTER_FACTOR = 1.5
 # Points of the scene for each of the object's, on the surface that both have, from which the scene is the denser.
 DENSER_FACTOR = 2.0
-# Side of the cells in which both sides' scatter is compared, in spacings of the sparser side, or twice the RESOLUTION
-# where that is more. Photos may confirm a point that is off, by chance; that a whole surface is rough shows beside the
-# other side's.
-ROUGH_SPACINGS = 4.0
 
 
 @dataclass(frozen=True)
@@ -117,7 +113,7 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float, share: floa
     fine = spacing(first.points)
     coarse = max(fine, spacing(points))
     if len(second):
-        rough, other_rough = _rougher(first, second, max(2 * RESOLUTION * diagonal, ROUGH_SPACINGS * coarse))
+        rough, other_rough = _rougher(first, second, 2 * max(RESOLUTION * diagonal, CELL_SPACINGS * coarse))
         mine, other = np.hypot(mine, rough), np.hypot(other, other_rough)
     is_denser = _times_as_many(second.points, first.points, coarse) > DENSER_FACTOR * share
     factor = 1 / BETTER_FACTOR if is_denser else BETTER_FACTOR
@@ -184,6 +180,7 @@ def _beside(points: Array, partners: Cloud) -> Array:
 def _rougher(one: Cloud, two: Cloud, side: float) -> tuple[Array, Array]:
     """How much more each of two clouds scatters about planes than the other does there, for its points (N,), (M,).
 
+    Photos may confirm a point that is off, by chance; that a whole surface is rough shows beside the other side's.
     A standard deviation, per cubic cell, separately for each of six facing directions. What is bent or has an
     edge scatters in both alike.
     """

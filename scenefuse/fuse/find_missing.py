@@ -16,7 +16,7 @@ from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import atomic_file, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.fuse.fuse_object import photos_of
-from scenefuse.fuse.measure import with_normals
+from scenefuse.fuse.measure import RESOLUTION, with_normals
 from scenefuse.fuse.missing import Lack, Missing, find_missing_surface
 from scenefuse.fuse.modes import around
 from scenefuse.fuse.next_photos import CLEARANCE, Plan, plan_stations, reach_of_stations
@@ -25,8 +25,6 @@ from scenefuse.geometry.photo_check import Photos
 from scenefuse.photos.geodesy import GridFrame, LocalFrame, length_unit, scene_frame
 from scenefuse.photos.workspace import View, with_mask
 
-MASK_PX = 400
-"""Longer side of the masks that the hull is counted in: finer than its cells."""
 POSITION = ("longitude_deg", "latitude_deg", "altitude_m")
 COLUMNS = ("station", "photo", "x", "y", "z", *POSITION, "above_close_ups", "heading_deg", "pitch_deg", "shows")
 """Of the table of photos; heading clockwise from north (from y without georeferencing), pitch up from the horizon."""
@@ -147,8 +145,8 @@ def _in_scene(inputs: MissingInputs, workspace: Path, pose: Sim3) -> tuple[Cloud
 
 
 def _silhouette(view: View, path: Path) -> View:
-    """The view, smaller, with its mask."""
-    small = with_mask(view, path).at_most(MASK_PX)
+    """The view with its mask, its longer side four pixels to a cell of the object's surface."""
+    small = with_mask(view, path).at_most(round(4 / RESOLUTION))
     return replace(small, pixels=small.pixels > 127)
 
 

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, plane_normals, spacing
+from scenefuse.cloud.clouds import Cloud, spacing
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.icp import similarity_rows
 from scenefuse.geometry.photo_check import Matches, Photos, match_in
-from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
+from scenefuse.geometry.surface import normals_at
 
 
 class Evidence(IntEnum):
@@ -93,8 +93,7 @@ def with_normals(cloud: Cloud) -> Cloud:
         return cloud
     if len(cloud) < 3:
         return replace(cloud, normals=np.tile(np.array([0, 0, 1], np.float32), (len(cloud), 1)))
-    index = cKDTree(cloud.points).query(cloud.points, k=min(NORMAL_NEIGHBOURS, len(cloud)), workers=threads())[1]
-    return replace(cloud, normals=plane_normals(cloud.points, index).astype(np.float32))
+    return replace(cloud, normals=normals_at(cloud.points, cloud.points).astype(np.float32))
 
 
 def with_evidence(known: Measured, otherwise: Evidence, of_pose: Array | float = 0.0) -> Cloud:

@@ -15,10 +15,11 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
-from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, THROUGH_PHOTOS
+from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, THROUGH_PHOTOS, THROUGH_SHARE
 from scenefuse.fuse.measure import RESOLUTION
 from scenefuse.geometry.depth_test import see, shown_in
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, match_in
+from scenefuse.geometry.photo_kernel import NOISE
 from scenefuse.geometry.visual_hull import Outline, count_silhouettes
 from scenefuse.photos.workspace import View
 
@@ -35,12 +36,8 @@ class Lack(IntEnum):
 BORDER_CELLS = 3
 # Share of the photos that may have a place of the hull outside their mask: masks err.
 MAX_OFF_MASK = 0.1
-# Share of the photos with a place in their picture that must see it for it to be empty off the masks.
-MIN_IN_SIGHT = 0.2
 # Cells beside each other that count: smaller spots are between points, not missing.
 MIN_SPOT_CELLS = 12
-# Standard deviation of a patch, in grey levels, below which its matches say nothing.
-MIN_TEXTURE = 4.0
 # Quantile of the distances between a surface's points that depth buffers go by: sparse parts have no holes then.
 SPARSEST = 0.9
 # Share of the diagonal within which a missing cell has a point of the object: what is seen past a wall without points
@@ -163,7 +160,7 @@ def _frontier(
     in_hull = (shown >= CONFIRMING_PHOTOS) & (off <= MAX_OFF_MASK * shown)
     seen = see(centres, surface, views, step, margin)
     # Off the masks nothing of the object is, where photos see the place at all; below the ground few do, through gaps.
-    in_sight = seen.in_view - seen.hidden >= np.maximum(THROUGH_PHOTOS, MIN_IN_SIGHT * seen.in_view)
+    in_sight = seen.in_view - seen.hidden >= np.maximum(THROUGH_PHOTOS, THROUGH_SHARE * seen.in_view)
     empty = (seen.through >= THROUGH_PHOTOS) | (~in_hull & in_sight)
     bare = ~grid.within(surface.points, SAME_PLACE_SPACINGS * grid.side)
     free = empty.reshape(grid.shape) & bare
@@ -203,7 +200,7 @@ def _classes(
         # Photos from nearly the same place say nothing of a point's place: they are not tested.
         seen = np.maximum(seen, np.minimum(shown, matches.tested + 1))
         texture = np.maximum(texture, matches.texture)
-    kinds = np.where(texture < MIN_TEXTURE, Lack.UNTEXTURED, Lack.CONTRADICTED)
+    kinds = np.where(texture < 3 * NOISE, Lack.UNTEXTURED, Lack.CONTRADICTED)
     return np.where(seen < CONFIRMING_PHOTOS, Lack.NEVER_SEEN, kinds).astype(np.uint8)
 
 

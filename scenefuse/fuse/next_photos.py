@@ -19,12 +19,10 @@ from scenefuse.geometry.photo_kernel import GOOD_ANGLE
 from scenefuse.photos.workspace import View
 
 # Directions that are tried, spread evenly over a sphere around the object, at these distances, in those of its
-# close-ups; cameras farther below the object's middle are left out.
-DIRECTIONS, DISTANCES, MIN_ELEVATION_DEG = 120, (0.7, 1.0, 1.4), -25.0
+# close-ups.
+DIRECTIONS, DISTANCES = 120, (0.7, 1.0, 1.4)
 # Share of the object's diagonal that a camera stays away from the ground and everything else.
 CLEARANCE = 0.05
-# What is nearer to the object's middle than so many diagonals hides by depth buffers, the rest by lines of sight.
-BESIDE_DIAGONALS = 0.6
 # Stations at most, and the share of what is missing that one must add.
 MAX_STATIONS, MIN_GAIN = 6, 0.05
 
@@ -73,18 +71,20 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
         return Plan([], 0.0)
     middle, distance = _close_ups_from(obj, close_ups)
     apart = np.linalg.norm(around.points - middle, axis=1)
-    beside = apart < BESIDE_DIAGONALS * obj.diagonal
+    # What stands beside the object hides by depth buffers, the rest by lines of sight.
+    clearance, reach = CLEARANCE * obj.diagonal, (0.5 + 2 * CLEARANCE) * obj.diagonal
+    beside = apart < reach
     if not beside.any():
         return Plan([], 0.0)
     assert around.normals is not None
     obstacles = voxel_downsample(Cloud(around.points[beside], around.normals[beside]), missing.side)
     others = voxel_downsample(
-        Cloud(around.points[beside | (apart < reach_of_stations(obj, close_ups))]), CLEARANCE * obj.diagonal / 2
+        Cloud(around.points[apart < max(reach, reach_of_stations(obj, close_ups))]), clearance / 2
     )
     step = max(missing.side, spacing(obstacles.points, quantile=SPARSEST))
     lens = sorted(close_ups, key=lambda view: view.intrinsics[0, 0] / view.width)[len(close_ups) // 2]
     photos = [_photos_from(place, middle, lens, up) for place in _around(middle, distance, up)]
-    free = _Free(others.points, middle, obj.diagonal, up)
+    free = _Free(others.points, middle, reach, clearance, up)
     photos = [three for three in photos if free.ways(np.array([photo.centre for photo in three]))]
     # What the middle photo shows is the most that all three do; these are tested only where it decides (Minoux 1978).
     shown = np.array([_shown_in_all(three[1:2], cells, obstacles, step, missing.side) for three in photos])
@@ -117,20 +117,20 @@ def reach_of_stations(obj: Cloud, close_ups: list[View]) -> float:
 
 
 def _around(middle: Array, distance: float, up: Array) -> Array:
-    """(P, 3) places around an object, not far below its middle, nearest first."""
+    """(P, 3) places around an object, nearest first."""
     number = np.arange(DIRECTIONS) + 0.5
     height, turn = 1 - 2 * number / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * number
     flat = np.sqrt(1 - height**2)
     directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
-    directions = directions[height > np.sin(np.radians(MIN_ELEVATION_DEG))] @ rotation_between(UP, up).T
+    directions = directions @ rotation_between(UP, up).T
     return np.concatenate([middle + factor * distance * directions for factor in sorted(DISTANCES)])
 
 
 class _Free:
     """Where a camera can be: above the ground, and with nothing between it and the object."""
 
-    def __init__(self, obstacles: Array, middle: Array, diagonal: float, up: Array):
-        self.middle, self.diagonal, self.clearance = middle, diagonal, CLEARANCE * diagonal
+    def __init__(self, obstacles: Array, middle: Array, reach: float, clearance: float, up: Array):
+        self.middle, self.reach, self.clearance = middle, reach, clearance
         self.level_from_scene = rotation_between(up, UP)
         self.level = obstacles @ self.level_from_scene.T
         self.near, self.below = cKDTree(obstacles), cKDTree(self.level[:, :2])
@@ -141,7 +141,7 @@ class _Free:
         if (at[:, 2] < self.level[self.below.query(at[:, :2])[1], 2] + self.clearance).any():
             return False
         ahead = self.middle - eyes
-        ends = np.maximum(0, 1 - BESIDE_DIAGONALS * self.diagonal / np.linalg.norm(ahead, axis=1))
+        ends = np.maximum(0, 1 - self.reach / np.linalg.norm(ahead, axis=1))
         steps = np.linspace(0, 1, 60)[:, None, None] * ends[:, None]
         return bool((self.near.query((eyes + steps * ahead).reshape(-1, 3))[0] > self.clearance).all())
 

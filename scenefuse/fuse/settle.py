@@ -10,24 +10,20 @@ from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
 from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.geometry.icp import ScaleRange, refine_planes
-from scenefuse.geometry.surface import Surface, with_queries
+from scenefuse.geometry.surface import SAMPLED_POINTS, Surface, with_queries
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.likelihood import PIECES_ACROSS
+from scenefuse.register.score import DISTINCT_SCALE_LOG
 from scenefuse.register.uncertainty import Uncertainty
 
 # Pairs within these shares of the diagonal, one after the other: an object a few per cent off still settles. One that
 # would move by more than the first (RMS) is not where the registration put it.
 REACHES = (0.04, 0.02, 0.01)
-# The scale stays within five per cent of what the registration found.
-SCALE_WIDTH = 0.05
-# Of each side's points so many at most, drawn evenly, look for a partner among four times as many. They are not
-# averaged, which would round corners off.
-MAX_QUERIES = 5000
-# An object that moves by more than this share of its diagonal was put at a wrong place, however certain that seemed.
+# An object that moves by more than this share of its diagonal was put at a wrong place, however certain that seemed. If
+# the poses of halves spread by more, the scale stays: a roof alone does not determine how large a house is.
 MIN_MISPLACED = FineSettings.max_translation_sd_fraction
-# Halves of the surfaces that are settled alike, and how far their poses may spread, over the diagonal, for the scale to
-# be settled too: a roof alone does not determine how large a house is.
-HALVES, MAX_SPREAD = 6, 0.003
+# Halves of the surfaces that are settled alike.
+HALVES = 6
 
 
 def settle(
@@ -55,9 +51,9 @@ def settle(
     if min(len(obj), len(scene)) < MIN_POINTS:
         return None
     mine, theirs = _surface(obj, seed), _surface(scene, seed)
-    pose, scales = _refined(mine, theirs, SCALE_WIDTH, diagonal), ScaleRange(1.0, SCALE_WIDTH)
+    pose, scales = _refined(mine, theirs, DISTINCT_SCALE_LOG, diagonal), ScaleRange(1.0, DISTINCT_SCALE_LOG)
     spread = half_sampling(mine, theirs, pose, scales, REACHES[1] * diagonal, HALVES, seed)
-    if spread is None or spread.size(diagonal) > MAX_SPREAD:
+    if spread is None or spread.size(diagonal) > MIN_MISPLACED:
         pose = _refined(mine, theirs, 0.0, diagonal)
     moved = float(np.sqrt(((pose.apply(obj.points) - obj.points) ** 2).sum(1).mean())) / diagonal
     if certain is not None and moved <= MIN_MISPLACED and (spread is None or certain < spread.size(diagonal)):
@@ -74,14 +70,14 @@ def _refined(mine: Surface, theirs: Surface, scale_width: float, diagonal: float
 
 
 def _surface(cloud: Cloud, seed: int) -> Surface:
-    """A cloud made ready for refinement."""
+    """A cloud made ready for refinement: drawn evenly, since averages would round corners off; a quarter queries."""
     rng = np.random.default_rng(seed)
-    thin = cloud[np.sort(rng.permutation(len(cloud))[: 4 * MAX_QUERIES])]
+    thin = cloud[np.sort(rng.permutation(len(cloud))[:SAMPLED_POINTS])]
     colors = None if thin.colors is None else thin.colors / 255.0
     assert thin.normals is not None
     normals = thin.normals.astype(np.float64)
     surface = Surface(thin.points, normals, colors, cKDTree(thin.points), np.arange(len(thin)))
-    return with_queries(surface, MAX_QUERIES, seed)
+    return with_queries(surface, SAMPLED_POINTS // 4, seed)
 
 
 def half_sampling(
@@ -112,7 +108,7 @@ def half_sampling(
         if half is None:
             return None
         # A scale that stays where it is put shows itself.
-        factor = 1 + SCALE_WIDTH if k % 2 else 1 / (1 + SCALE_WIDTH)
+        factor = 1 + DISTINCT_SCALE_LOG if k % 2 else 1 / (1 + DISTINCT_SCALE_LOG)
         start = Sim3(factor, np.eye(3), (1 - factor) * pose.apply(centre)) @ pose
         other = refine_planes(*half, start, scales, tau, rounds=30)
         deviations[k, :3] = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()

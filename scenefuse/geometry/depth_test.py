@@ -22,12 +22,11 @@ from scenefuse.geometry.photo_kernel import MIN_COSINE
 from scenefuse.photos.pictures import read_depth
 from scenefuse.photos.workspace import View, posed_images, read_model, view_of
 
-# Cosine of the angle between a normal and the direction to a camera, from which on a surface stands in the way.
-FACING_COSINE = 0.1
-# Side of a cell in spacings of the surface's points, so that a surface has no holes between them.
-CELL_SPACINGS = 2.0
+# Side of a cell in spacings of the surface's points, so that a surface has no holes between them; and how many spacings
+# behind the nearest points a noisy surface still reaches.
+CELL_SPACINGS, SURFACE_SPACINGS = 2.0, 8.0
 # Cells of 3 x 3 that must hold a surface to say that a point is hidden behind it, or that a photo sees through it.
-MIN_CELLS_HIDING, MIN_CELLS_BEHIND = 5, 7
+MIN_CELLS = 7
 # Below this share of points with a measurement on their rays, depth maps tell nothing of an object.
 MIN_MEASURED = 0.1
 
@@ -140,19 +139,18 @@ def shown_in(
 
 
 def _surface_in(surface: Cloud, view: View, spacing: float, both_sides: bool = False) -> tuple[View, Array]:
-    """The photo in cells: the least depth of the surface in the 3 x 3 cells around each, where MIN_CELLS_BEHIND of
-    them hold some, and the largest (H, W), where MIN_CELLS_HIDING do; 0 elsewhere."""
+    """The photo in cells: the least depth of the surface in the 3 x 3 cells around each, and the largest (H, W), where
+    MIN_CELLS of them hold some; 0 elsewhere."""
     assert surface.normals is not None
     towards = view.centre - surface.points
-    facing = (surface.normals * towards).sum(1) > FACING_COSINE * np.linalg.norm(towards, axis=1)
+    facing = (surface.normals * towards).sum(1) > MIN_COSINE * np.linalg.norm(towards, axis=1)
     buffer = depth_buffer(surface.points[both_sides | facing], view, CELL_SPACINGS * spacing)
     height, width = buffer.pixels.shape
     padded = np.pad(buffer.pixels, 1)
     shifted = np.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])
-    known = (shifted > 0).sum(0)
+    known = (shifted > 0).sum(0) >= MIN_CELLS
     least = np.where(shifted > 0, shifted, np.inf).min(0)
-    nearest = np.where(known >= MIN_CELLS_BEHIND, least, 0.0)
-    return replace(buffer, pixels=nearest), np.where(known >= MIN_CELLS_HIDING, shifted.max(0), 0.0)
+    return replace(buffer, pixels=np.where(known, least, 0.0)), np.where(known, shifted.max(0), 0.0)
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenefuse.core.transforms import Array
+from scenefuse.geometry.icp import MAX_TRIPLES
 
-# Cells along each side of the square around the ring; one low point stands for each.
+# Cells along each side of the square around the ring; one low point stands for each, and half as many fix the ground.
 CELLS = 40
-# Fewer cells than these fix no ground.
-MIN_CELLS = 20
-# Triples of cells drawn; the plane must hold this share of the cells, and rise by less than 45 degrees.
-TRIPLES, MIN_SHARE = 400, 0.3
+# The plane must hold this share of the cells, and rise by less than 45 degrees.
+MIN_SHARE = 0.3
 # Cells of a strip narrower than this share of its length, a ledge or the foot of a wall, fix no slope across it.
 MIN_BREADTH = 0.2
 
@@ -70,7 +69,7 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
     if not len(around):
         return None
     lowest = _lowest(around, low[:2] - ring, float((high[:2] - low[:2] + 2 * ring).max()) / CELLS)
-    if len(lowest) < MIN_CELLS:
+    if len(lowest) < CELLS // 2:
         return None
     centre = (low[:2] + high[:2]) / 2
     plane = _plane_by_triples(lowest[:, :2] - centre, lowest[:, 2], 2 * tolerance, seed)
@@ -120,7 +119,7 @@ def _height_field(xy: Array, z: Array, plane: Array, tolerance: float) -> Array:
             residual = z - terms @ coefficients
             weight = (1 - np.minimum(np.abs(residual) / (3 * tolerance), 1) ** 2) ** 2
             root = np.sqrt(weight)[:, None]
-            if (weight > 0).sum() < MIN_CELLS:
+            if (weight > 0).sum() < CELLS // 2:
                 break
             solved = np.linalg.lstsq(root * terms[:, :columns], root[:, 0] * z, rcond=None)[0]
             coefficients = np.concatenate([solved, np.zeros(6 - columns)])
@@ -132,7 +131,7 @@ def _height_field(xy: Array, z: Array, plane: Array, tolerance: float) -> Array:
 def _plane_by_triples(xy: Array, z: Array, tolerance: float, seed: int) -> Array | None:
     """The (3,) plane a + b x + c y with most points within `tolerance`, or None."""
     rng = np.random.default_rng(seed)
-    triples = rng.integers(0, len(xy), (TRIPLES, 3))
+    triples = rng.integers(0, len(xy), (MAX_TRIPLES, 3))
     terms = quadratic_terms(xy)[:, :3]
     matrices = terms[triples]
     good = np.abs(np.linalg.det(matrices)) > 1e-6 * np.ptp(xy, axis=0).max() ** 2

@@ -11,14 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.geometry.surface import Pairs, Surface, color_gain, pair
+from scenefuse.geometry.surface import SAMPLED_POINTS, Pairs, Surface, color_gain, pair
 
 # Weight of point-to-point rows beside point-to-plane rows: enough to stop sliding, too little to hold planes back.
 POINT_WEIGHT = 0.1
 # Weight of colour rows against geometry in the polish; both are in units of their own spread.
 COLOR_WEIGHT = 0.3
-# Fewer pairs than this in either direction fix no similarity.
-MIN_PAIRS = 10
 # A linearised step changes the scale by this at most (natural logarithm).
 MAX_SCALE_STEP = 0.05
 # Of a model's points that are laid on a cloud, this share counts, those nearest: others are off its surface, or
@@ -49,19 +47,16 @@ class ScaleRange:
         return self.width > 0 and abs(np.log(scale / self.centre)) > self.width - 0.01
 
 
-def refine_points(
-    obj: Surface, scene: Surface, start: Sim3, scales: ScaleRange, tau: tuple[float, float], rounds: int = 25
-) -> Sim3:
+def refine_points(obj: Surface, scene: Surface, start: Sim3, scales: ScaleRange, tau: tuple[float, float]) -> Sim3:
     """Two-way ICP with Tukey weights and Horn's symmetric scale (Horn 1987), threshold shrinking from tau[0] to tau[1].
 
     Pairs from both directions count alike: a one-way fit with free scale shrinks the object.
     """
     pose = start
-    for step in range(rounds):
-        threshold = tau[0] * (tau[1] / tau[0]) ** (step / max(rounds - 1, 1))
+    for threshold in np.geomspace(*tau, 25):
         pairs = pair(obj, scene, pose, threshold)
         backward = len(pairs.distance) - pairs.forward
-        if min(pairs.forward, backward) < MIN_PAIRS:
+        if min(pairs.forward, backward) < 7:  # as many as a similarity has parameters
             return pose
         weights = _two_way_weights(pairs, threshold)
         x, y = obj.points[pairs.object_index], scene.points[pairs.scene_index]
@@ -115,7 +110,7 @@ def refine_on_cloud(own: Array, points: Array, steps: int = 20, neighbours: int 
     Point to plane (Chen and Medioni 1992), of the nearest 70 % at each step (trimmed ICP, Chetverikov et al. 2005); a
     plane is fitted to the neighbours in the cloud.
     """
-    own, tree, found = own[:: max(1, len(own) // 20_000)], cKDTree(points), Sim3.identity()
+    own, tree, found = own[:: max(1, len(own) // SAMPLED_POINTS)], cKDTree(points), Sim3.identity()
     for _ in range(steps):
         moved = found.apply(own)
         distance, near = tree.query(moved, neighbours, workers=threads())
@@ -190,7 +185,7 @@ def _rows(obj: Surface, scene: Surface, pose: Sim3, tau: float, color_weight: fl
     """Rows of the pairs both ways, None with too few: point-to-plane, a little point-to-point against the sliding that
     planes leave free, and colours where both sides have them."""
     pairs = _without_overhang(obj, scene, pose, tau, pair(obj, scene, pose, tau))
-    if min(pairs.forward, len(pairs.distance) - pairs.forward) < MIN_PAIRS:
+    if min(pairs.forward, len(pairs.distance) - pairs.forward) < 7:
         return None
     p, q = pose.apply(obj.points[pairs.object_index]), scene.points[pairs.scene_index]
     centre = p.mean(0)

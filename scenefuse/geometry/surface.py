@@ -13,6 +13,8 @@ from scenefuse.core.transforms import Array, Sim3
 
 # Neighbours that a plane is fitted to for a normal.
 NORMAL_NEIGHBOURS = 16
+# Points that stand for a cloud where all would take long.
+SAMPLED_POINTS = 20_000
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,12 @@ def prepare(cloud: Cloud, voxel: float, seed: int, most: int) -> Surface:
     if thin.colors is not None:
         colors = (thin.colors[neighbours[:, :6]].astype(np.float64) / 255).mean(1)
     return Surface(thin.points, normals, colors, tree, np.arange(len(thin)))
+
+
+def normals_at(points: Array, places: Array) -> Array:
+    """Normals (M, 3), on either side, of the planes through the points (N, 3) nearest to each of `places` (M, 3)."""
+    neighbours = cKDTree(points).query(places, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
+    return plane_normals(points, neighbours)
 
 
 def with_queries(surface: Surface, count: int, seed: int = 0) -> Surface:

@@ -9,8 +9,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import back_project
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
-from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
-from scenefuse.mvs.view_selection import select_views
+from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS, select_views
 from scenefuse.photos.workspace import Rows, View, Workspace
 
 # As coarse as masks need it: points next to an outline do not vote.

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing
+from scenefuse.cloud.strays import NEIGHBOURS
 from scenefuse.cloud.tiled_cloud import WHOLE, write_tiled
 from scenefuse.core.stage import StageError, quantity, read_json, scratch_directory, setting, threads, value, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import neighbours, vote
+from scenefuse.geometry.photo_check import MAX_PHOTOS
 from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.pictures import read_depth, write_depth
 from scenefuse.photos.workspace import View, posed_images, read_model, read_views
@@ -24,11 +26,8 @@ from scenefuse.sfm.colmap import cancellable
 
 # Share of the measured pixels below which the cameras or the limits are probably wrong.
 MIN_FUSED_SHARE = 0.01
-# Photos whose maps are kept in memory, for the next photo's vote and by COLMAP, which follows a point through 50.
-CACHED_MAPS = 64
-# Neighbours whose mean distance shows a point far from all others; it is dropped when that is more than so many times
-# the cloud's median.
-OUTLIER_NEIGHBOURS, OUTLIER_RATIO = 8, 4.0
+# A point is dropped where the mean distance of its neighbours is more than so many times the cloud's median.
+OUTLIER_RATIO = 4.0
 
 
 @dataclass(frozen=True)
@@ -146,8 +145,9 @@ def _fuse(
     """
     largest = max(_path(folder, "depth_maps", name).stat().st_size for name, folder in maps.items()) // 4
     photo = max(view.width * view.height for view in read_views(workspace / "sparse"))
-    # Bytes of a pixel: 16 of its depth and normal, 3 of the photo, which COLMAP keeps at its own size.
-    cached = CACHED_MAPS * (16 * largest + 3 * photo)
+    # COLMAP follows a point through 50 photos. Bytes of a pixel: 16 of its depth and normal, 3 of the photo, which it
+    # keeps at its own size.
+    cached = MAX_PHOTOS * (16 * largest + 3 * photo)
     widths = {name: _map_width(_path(folder, "depth_maps", name)) for name, folder in maps.items()}
     with linked_workspace(workspace, beside, widths) as folder:
         for name, source in maps.items():
@@ -187,7 +187,7 @@ def _voted(
     """Each photo, its number of depths, and its depths (H, W) that more maps confirm than see through."""
     cameras = {view.name: view for view in read_views(workspace / "sparse")}
 
-    @lru_cache(CACHED_MAPS)
+    @lru_cache(MAX_PHOTOS)
     def depths(name: str) -> View:
         pixels = read_depth(_path(maps[name], "depth_maps", name))
         return replace(cameras[name].resized(pixels.shape[1], pixels.shape[0]), pixels=pixels)
@@ -229,11 +229,11 @@ def _read_visibility(path: Path) -> NDArray[np.uint16]:
 
 def near_others(points: Array) -> NDArray[np.bool_]:
     """(N,) True where a point's neighbours are about as near as they are for the others."""
-    if len(points) <= OUTLIER_NEIGHBOURS:
+    if len(points) <= NEIGHBOURS:
         return np.ones(len(points), dtype=bool)
     tree, distance = cKDTree(points), np.empty(len(points))
     for rows in np.array_split(np.arange(len(points)), -(-len(points) // WHOLE)):
-        distance[rows] = tree.query(points[rows], k=OUTLIER_NEIGHBOURS + 1, workers=threads())[0][:, 1:].mean(1)
+        distance[rows] = tree.query(points[rows], k=NEIGHBOURS + 1, workers=threads())[0][:, 1:].mean(1)
     return distance <= OUTLIER_RATIO * np.median(distance)
 
 

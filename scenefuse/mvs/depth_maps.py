@@ -14,7 +14,7 @@ from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, manifest, quantity, threads, write_json
 from scenefuse.mvs.dense_cloud import linked_workspace
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
-from scenefuse.mvs.view_selection import Reference, select_views
+from scenefuse.mvs.sparse_depths import Reference, select_views
 from scenefuse.photos.pictures import read_depth, write_depth, write_normals
 from scenefuse.photos.workspace import View, Workspace, read_workspace
 from scenefuse.sfm.colmap import cancellable

@@ -7,15 +7,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import back_project
 from scenefuse.geometry.matcher import Matcher
 from scenefuse.mvs.plane_sweep import DepthMapSettings, refine_by_matching
+from scenefuse.mvs.sparse_depths import pair_worth
 from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import View
 
-# Between two photos: enough baseline to measure, little enough to look alike.
-BEST_ANGLE_DEG = 15.0
 # Places of a photo's depth map that other photos are chosen by; behind another's surface by this share of its depth, a
 # place is hidden there.
 PLACES, HIDDEN_SHARE = 200, 0.05
@@ -51,8 +49,8 @@ class RefinementSettings:
 def refine_by_photos(views: Views, depths: NDArray[np.float32], settings: RefinementSettings) -> RefinedDepths:
     """Depth maps (V, H, W) with every pixel moved along its ray to the best match.
 
-    Windows of a photo are matched with those of the eight photos that show most of the same from about 15 degrees
-    aside; the best three count (`scenefuse.mvs.plane_sweep`). A pixel whose match is poor, hardly better than where it
+    Windows of a photo are matched with those of the eight photos that are worth most (`choose_sources`); the best three
+    count (`scenefuse.mvs.plane_sweep`). A pixel whose match is poor, hardly better than where it
     was, or farther off than the reach, keeps its depth. Where there is texture that matches neither there nor nearby
     in photos that have the place in view, the depth is not photo-consistent.
 
@@ -98,7 +96,7 @@ def _cut(view: View, top: int, left: int, bottom: int, right: int) -> View:
 
 
 def choose_sources(views: Views, depths: NDArray[np.float32]) -> NDArray[np.int64]:
-    """(V, S) for each photo those that show most of what it shows, from about 15 degrees beside it; the best first."""
+    """(V, S) for each photo those that are worth most by what both show (`pair_worth`), the best first."""
     poses, places = views.object_from_cam, np.full((len(depths), PLACES, 3), np.nan)
     for index, depth in enumerate(depths):
         rows, columns = np.nonzero(depth > 0)
@@ -106,20 +104,12 @@ def choose_sources(views: Views, depths: NDArray[np.float32]) -> NDArray[np.int6
             chosen = np.linspace(0, len(rows) - 1, PLACES).round().astype(int)
             rows, columns = rows[chosen], columns[chosen]
             places[index] = back_project(depth[rows, columns], views.intrinsics[index], poses[index], rows, columns)
-    centres, middles = poses[:, :3, 3], np.nan_to_num(places.mean(axis=1))
-    worth = np.full((len(depths), len(depths)), -np.inf)
+    centres, worth = poses[:, :3, 3], np.full((len(depths), len(depths)), -np.inf)
     for index, depth in enumerate(depths):
         shown, pixels, away = views.view(index).visible(places.reshape(-1, 3))
         there = depth[pixels[:, 1], pixels[:, 0]]
         shown = shown[(there == 0) | (away <= (1 + HIDDEN_SHARE) * there)]
-        share = np.bincount(shown // PLACES, minlength=len(depths)) / PLACES
-        off = np.abs(_angles_deg(centres - middles, centres[index] - middles) - BEST_ANGLE_DEG)
-        worth[:, index] = share / (1 + off / BEST_ANGLE_DEG)
-    np.fill_diagonal(worth, -np.inf)
+        for other in np.flatnonzero(np.arange(len(depths)) != index):
+            both = places[other, shown[shown // PLACES == other] % PLACES]
+            worth[other, index] = pair_worth(both, centres[other], centres[index])[0]
     return np.argsort(-worth, axis=1, kind="stable")[:, : min(DepthMapSettings.sources, len(poses) - 1)]
-
-
-def _angles_deg(a: Array, b: Array) -> Array:
-    """Angles (N,) between vectors (N, 3)."""
-    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    return np.asarray(np.degrees(np.arccos(np.clip((a * b).sum(1) / np.maximum(lengths, 1e-12), -1.0, 1.0))))

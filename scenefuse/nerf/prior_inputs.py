@@ -14,8 +14,7 @@ from torch import Tensor
 
 from scenefuse.core.stage import StageError
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
-from scenefuse.mvs.sparse_depths import beside_mask, own_points
-from scenefuse.mvs.view_selection import pair_worth
+from scenefuse.mvs.sparse_depths import beside_mask, own_points, pair_worth
 from scenefuse.nerf.monodepth import disparity_from_depth, points_in_cam
 from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import View

@@ -8,14 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, plane_normals, sampled, spacing
+from scenefuse.cloud.clouds import Cloud, sampled, spacing
 from scenefuse.core.stage import atomic_file, quantity, threads
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
+from scenefuse.geometry.surface import NORMAL_NEIGHBOURS, SAMPLED_POINTS, normals_at
 from scenefuse.photos.pictures import write_picture
 
-# Points of each cloud that are drawn, and at which normals are compared with their neighbours'.
-SAMPLED_POINTS = 20_000
 # Of each of the picture's six views.
 SIDE_PX = 460
 
@@ -54,7 +52,7 @@ def registration_metrics(
     inlier = ahead <= tau
     source, target = float(inlier.mean()), float((back <= tau).mean())
     rmse = float(np.sqrt((ahead[inlier] ** 2).mean())) if inlier.any() else None
-    normals_object, normals_scene = (_normals(points, points) for points in (moved, scene.points))
+    normals_object, normals_scene = (normals_at(points, points) for points in (moved, scene.points))
     facing = np.abs((normals_object[inlier] * normals_scene[partner[inlier]]).sum(1))
     return {
         "fitness": quantity(target, "1"),
@@ -78,14 +76,8 @@ def self_consistency(points: Array) -> float:
     tree, at = cKDTree(points), sampled(points, SAMPLED_POINTS, seed=0)
     neighbours = tree.query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
     used, place = np.unique(neighbours, return_inverse=True)
-    normals = _normals(points, points[used])[place.reshape(neighbours.shape)]
+    normals = normals_at(points, points[used])[place.reshape(neighbours.shape)]
     return float(np.abs(np.einsum("nk,njk->nj", normals[:, 0], normals[:, 1:])).mean())
-
-
-def _normals(points: Array, at: Array) -> Array:
-    """Normals (M, 3) of the planes through the points (N, 3) nearest to each of `at` (M, 3)."""
-    neighbours = cKDTree(points).query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
-    return plane_normals(points, neighbours)
 
 
 def draw_alignment(path: Path, cloud: Cloud, scene: Cloud, scene_from_object: Sim3, seed: int) -> None:

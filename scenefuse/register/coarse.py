@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import quantity, threads, write_json
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
@@ -29,10 +30,6 @@ from scenefuse.register.score import RECALL_WEIGHT, SCORE_FRACTION, Hypothesis, 
 
 Candidate = tuple[Sim3, str]
 
-# Voxel of the upright sweep, as a share of the scene crop's diagonal: a fast Fourier transform of some 50^3 cells.
-SWEEP_VOXEL_FRACTION = 0.045
-BRIEF_ROUNDS = 12
-
 
 @dataclass(frozen=True)
 class CoarseSettings:
@@ -41,7 +38,7 @@ class CoarseSettings:
     max_tilt_deg: float = 10
     """Largest angle between the up directions of object and scene that the search allows, where both are known."""
     voxel_fractions: tuple[float, ...] = (0.04, 0.03)
-    """Voxels of the feature pyramid, as shares of the scene crop's diagonal."""
+    """Voxels of the feature pyramid, as shares of the scene crop's diagonal; those of the sweep are the first."""
     ransac_samples: int = 30000
     """Random triples of matches drawn at each level of the pyramid."""
     feature_scale_steps: int = 3
@@ -126,19 +123,20 @@ def find_hypotheses(problem: Problem, settings: CoarseSettings) -> list[Hypothes
 
     refined = []
     for start, source in best(upright) + best(by_features)[:room]:
-        pose = refine_points(*both, start, scales, (3 * tau, tau), BRIEF_ROUNDS)
+        pose = refine_points(*both, start, scales, (3 * tau, tau))
         refined.append(Hypothesis(pose, source, score(*both, pose, tau, scales.centre)))
     return best_distinct(refined, obj.points.mean(0), diagonal, settings.keep)
 
 
 def _upright(problem: Problem, settings: CoarseSettings) -> list[Sim3]:
     """The sweep of yaw, scale and shift; nothing where gravity is not known."""
-    ups, scales, voxel = problem.known.ups, problem.scales, SWEEP_VOXEL_FRACTION * problem.scene.diagonal
+    ups, scales, fraction = problem.known.ups, problem.scales, settings.voxel_fractions[0]
     if ups is None:
         return []
     level = Sim3(1.0, rotation_between(ups[1], UP), np.zeros(3))
-    obj, scene = problem.surfaces(scales.centre, SWEEP_VOXEL_FRACTION / 2, SURFACE_POINTS // 2)
+    obj, scene = problem.surfaces(scales.centre, fraction / 2, SURFACE_POINTS // 2)
     steps, most = (settings.scale_steps, settings.yaw_steps), settings.candidates // 2
+    voxel = fraction * problem.scene.diagonal
     found = upright_candidates(obj, scene.transformed(level), ups[0], scales, *steps, voxel, most)
     return [level.inverse() @ pose for pose in found]
 
@@ -283,10 +281,10 @@ def upright_candidates(
     target, scene_count = _occupancy(scene.points - low, voxel, shape)
     target_f = fft.rfftn(_blur(target), workers=threads())
     b = RECALL_WEIGHT**2
-    found: list[tuple[float, float, float, Array]] = []
+    found: list[tuple[float, Sim3]] = []
     for scale in factors:
         for yaw in np.arange(yaw_steps) * 2 * np.pi / yaw_steps:
-            turn = _about_z(yaw)
+            turn = Rotation.from_euler("z", yaw).as_matrix()
             turned = scale * points @ turn.T
             corner = turned.min(0)
             grid, count = _occupancy(turned - corner, voxel, shape)
@@ -295,9 +293,9 @@ def upright_candidates(
             f_beta = (1 + b) * shared[best] / (b * scene_count + count)
             step = np.array([i - n if i > n // 2 else i for i, n in zip(best, shape)])
             # Voxel i of the scene meets voxel i - step of the object.
-            found.append((float(f_beta), float(scale), float(yaw), low + step * voxel - corner))
-    found.sort(key=lambda h: -h[0])
-    return [_pose(scale, _about_z(yaw) @ upright, shift, centre) for _, scale, yaw, shift in found[:keep]]
+            rotation, shift = turn @ upright, low + step * voxel - corner
+            found.append((float(f_beta), Sim3(float(scale), rotation, shift - scale * rotation @ centre)))
+    return [pose for _, pose in sorted(found, key=lambda h: -h[0])[:keep]]
 
 
 def _occupancy(points: Array, voxel: float, shape: tuple[int, ...]) -> tuple[NDArray[np.float32], float]:
@@ -312,15 +310,6 @@ def _blur(grid: NDArray[np.float32]) -> NDArray[np.float32]:
     for axis in range(3):
         grid = 0.5 * grid + 0.25 * (np.roll(grid, 1, axis) + np.roll(grid, -1, axis))
     return np.minimum(1.6 * grid, 1.0)
-
-
-def _about_z(angle: float) -> Array:
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _pose(scale: float, rotation: Array, shift: Array, centre: Array) -> Sim3:
-    return Sim3(scale, rotation, shift - scale * rotation @ centre)
 
 
 def _centred(problem: Problem) -> Hypothesis:

@@ -195,7 +195,7 @@ def test_what_colmap_keeps_in_memory_is_room_for_photos_that_are_larger_than_the
     workspace, tmp_path, monkeypatch
 ):
     small, kept, fusion = replace(DEPTH, max_image_size_px=80), [], pycolmap.stereo_fusion
-    monkeypatch.setattr(dense_cloud, "CACHED_MAPS", 5)
+    monkeypatch.setattr(dense_cloud, "MAX_PHOTOS", 5)
     monkeypatch.setattr(
         pycolmap, "stereo_fusion", lambda *w, **more: kept.append(w[5].cache_size) or fusion(*w, **more)
     )

@@ -129,7 +129,7 @@ def test_refinement_recovers_a_disturbed_similarity(house):
     middle = truth.apply(centre)
     start = Sim3(1.04, turn, middle - 1.04 * turn @ middle + 0.2) @ truth
     scales = ScaleRange(truth.scale, 0.2)
-    pose = refine_points(obj, scene, start, scales, (0.7, 0.25), 25)
+    pose = refine_points(obj, scene, start, scales, (0.7, 0.25))
     pose = refine_planes(obj, scene, pose, scales, 0.25, 0.3, 10)
     scale, angle, shift = errors(pose, truth, centre, house.diagonal)
     assert abs(scale) < 1 and angle < 1 and shift < 0.005
@@ -146,7 +146,7 @@ def test_what_the_scene_does_not_show_does_not_shrink_the_object():
 def test_a_prior_of_no_width_holds_the_scale(house):
     obj, scene = surfaces(house, 0.2)
     held = ScaleRange(house.scene_from_object.scale * 1.1, 0.0)
-    pose = refine_points(obj, scene, house.scene_from_object, held, (0.5, 0.3), 5)
+    pose = refine_points(obj, scene, house.scene_from_object, held, (0.5, 0.3))
     pose = refine_planes(obj, scene, pose, held, 0.3, 0.3, 5)
     assert pose.scale == held.centre
 

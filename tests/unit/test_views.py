@@ -7,7 +7,7 @@ import pytest
 
 from scenefuse.core.stage import StageError
 from scenefuse.geometry.visual_hull import Outline, count_silhouettes
-from scenefuse.mvs.view_selection import select_views
+from scenefuse.mvs.sparse_depths import select_views
 from scenefuse.nerf.prior_inputs import crop_to_object
 from scenefuse.photos.views import load_views, scales
 from scenefuse.photos.workspace import View, read_workspace

@@ -212,7 +212,6 @@ RULES = [
     Rule("RANSAC: edges agree on one scale", f"{R}.coarse.triples_of_one_scale",
          lambda f: lambda *known: f(*known, 0.0)),
     Rule("sweep: blurred target", f"{R}.coarse._blur", same),
-    Rule("coarse: brief refinement", f"{R}.coarse.BRIEF_ROUNDS", constant(1)),
     # Refinement.
     Rule("refine: turned copies", f"{R}.refinement._Work.turned", nothing),
     Rule("refine: repetition", f"{R}.refinement.shifts_onto_itself", nothing),

@@ -194,7 +194,7 @@ RULES = [
         "what masks call something else goes", f"{S}.crop_cloud", lambda f: lambda a, b, c, d, other=None: f(a, b, c, d)
     ),
     Rule("a vote needs an own point nearby", f"{V}.MAX_OWN_DISTANCE", constant(9.0)),
-    Rule("what hides takes no vote", f"{V}.HIDDEN_CELLS", constant(1e9)),
+    Rule("what hides takes no vote", f"{V}.SURFACE_SPACINGS", constant(1e9)),
     Rule("enough photos frame a point", f"{V}.least_framing", lambda _: lambda *__: 0),
     Rule("box wider by pairing distances", f"{C}.MARGIN_FRACTION", constant(0.0)),
     Rule("all clicks outside apart by planes", f"{P}.MAX_VARIATION", constant(0.0)),
@@ -211,8 +211,8 @@ RULES = [
     *around("ring", f"{C}.RING_FRACTION"),
     *around("ground's thickness", f"{C}.GROUND_FRACTION"),
     *around("cells", f"{V}.CELL_SPACINGS"),
-    *around("hidden cells", f"{V}.HIDDEN_CELLS"),
+    *around("thickness of what hides", f"{V}.SURFACE_SPACINGS"),
     *around("own points' reach", f"{V}.MAX_OWN_DISTANCE"),
-    *around("ray spacings", f"{P}.RAY_SPACINGS"),
-    *around("depth spacings", f"{P}.DEPTH_SPACINGS"),
+    *around("ray spacings", f"{P}.CELL_SPACINGS"),
+    *around("depth spacings", f"{P}.SURFACE_SPACINGS"),
 ]

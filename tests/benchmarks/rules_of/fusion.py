@@ -93,7 +93,7 @@ def _matched(points: Any, normals: Any, photos: Photos) -> Matches:
 
 def evaluate(trial: int, rule: Rule | None) -> dict[str, Any]:
     """F-scores of the completed scene at 0.25, 0.5 and 1 % of the diagonal, points added and taken away."""
-    changes_matching = rule is not None and ".geometry." in rule.where
+    changes_matching = rule is not None and ".geometry.photo" in rule.where
     if rule is None:
         _known.clear()
     _compile(photo_kernel.REFERENCES, photo_kernel.GREY_FALL)
