@@ -26,8 +26,8 @@ from scenefuse.register.reprojection import (
 )
 from scenefuse.register.uncertainty import MAX_DEVIATIONS, Uncertainty, uncertainty_quantities
 
-# Random triples of matches drawn, and the matches that rank those which are tried.
-RANSAC_SAMPLES, RANKING_MATCHES = 100_000, 300
+# Random triples of matches drawn.
+RANSAC_SAMPLES = 100_000
 # Largest reprojection error of an inlier, RMS, in pixels of the coarser photos.
 MAX_ERROR_PX = 6.0
 # The gate: inliers of the best pose among the other matches, over inliers; standard deviations of scale and rotation.
@@ -48,7 +48,7 @@ class AlignmentSettings:
     """Lowe's ratio test: descriptor distance to the best over that to the second-best point."""
     nearest_points: int = 200
     """Shared points that fix the pose, those nearest to where the object's photos look: far from it both models may be
-    bent against each other."""
+    bent against each other. As many rank the poses of RANSAC."""
     gps_accuracy_m: float = 3.0
     """Standard error of the GPS positions of either side that state none, when they are compared."""
 
@@ -189,7 +189,7 @@ def _most_supported(seen: Observations, seed: int) -> Sim3 | None:
             proposed.append(fit_sim3(seen.x[triple], seen.y[triple]))
     if not proposed:
         return None
-    few = seen.subset(np.isin(np.arange(len(seen.x)), rng.permutation(len(seen.x))[:RANKING_MATCHES]))
+    few = seen.subset(np.isin(np.arange(len(seen.x)), rng.permutation(len(seen.x))[: AlignmentSettings.nearest_points]))
     finalists = sorted(proposed, key=lambda p: _cost(few, p, 2 * MAX_ERROR_PX))[:RANSAC_POSES]
     return min((_polished(seen, p) for p in finalists), key=lambda p: _cost(seen, p, MAX_ERROR_PX))
 

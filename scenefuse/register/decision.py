@@ -11,10 +11,11 @@ from scenefuse.core.stage import setting
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.geometry.surface import Surface
 from scenefuse.register.problem import Problem
-from scenefuse.register.repetition import END_PERCENTILES, MIN_SELF_AGREEMENT
+from scenefuse.register.repetition import ends_of
 from scenefuse.register.score import (
     DISTINCT_ANGLE_DEG,
     DISTINCT_SHIFT,
+    MIN_MARGIN,
     SCORE_FRACTION,
     Hypothesis,
     color_agreement,
@@ -46,7 +47,7 @@ class FineSettings:
 
     min_f_score: float = 0.35
     """Gate: smallest two-way F-score."""
-    min_margin: float = 0.04
+    min_margin: float = MIN_MARGIN
     """Gate: smallest relative lead of the score over the best pose that differs."""
     max_scale_sd_log: float = setting(0.01, least=0)
     """Gate: largest standard deviation of the scale, natural logarithm."""
@@ -285,10 +286,10 @@ def _turns_onto_itself(obj: Surface, motion: Sim3, tau: float) -> bool:
     if rotation_angle_deg(motion.rotation) <= DISTINCT_ANGLE_DEG:
         return False
     axes = np.linalg.svd(obj.points - obj.points.mean(0), full_matrices=False)[2]
-    middle = np.percentile(obj.points @ axes.T, END_PERCENTILES, axis=0).mean(0) @ axes
+    middle = ends_of(obj.points @ axes.T).mean(0) @ axes
     if np.linalg.norm(motion.apply(middle) - middle) > tau:
         return False
     pairs = pair(obj, obj, motion, tau)
     ahead, back = pairs.forward / len(obj.queries), (len(pairs.distance) - pairs.forward) / len(obj.queries)
     color = color_agreement(obj, obj, pairs)
-    return min(ahead, back) > MIN_SELF_AGREEMENT and (color is None or color > MIN_SELF_COLOR)
+    return min(ahead, back) > 1 - MIN_MARGIN and (color is None or color > MIN_SELF_COLOR)

@@ -17,13 +17,11 @@ from scenefuse.register.coarse import Candidate
 from scenefuse.register.decision import DecidedBy, FineSettings, tilt_deg
 from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, read_alignment
 from scenefuse.register.refinement import Outcome, refine_hypotheses
-from scenefuse.register.score import Hypothesis
+from scenefuse.register.score import SCORE_FRACTION, Hypothesis
 from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities, with_bending
 
 # Photos whose depth maps give the free space; more look from sides that these have seen.
 FREE_SPACE_PHOTOS = 12
-# A measurement this far beyond a point, as a share of the diagonal, shows that nothing stands there.
-FREE_SPACE_TOLERANCE = 0.03
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class ConstraintFiles:
         """The free space around a scene crop, or None without depth maps."""
         if self.workspace is None:
             return None
-        tolerance = FREE_SPACE_TOLERANCE * scene.diagonal
+        tolerance = SCORE_FRACTION * scene.diagonal
         return read_free_space(self.workspace, self.depth, scene.points, FREE_SPACE_PHOTOS, tolerance)
 
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, moved_about, similarity_rows
 from scenefuse.geometry.surface import Surface
 from scenefuse.register.score import MIN_COLOR_NOISE, SCORE_FRACTION
@@ -28,8 +29,6 @@ MIN_NOISE = 0.75
 PIECES_ACROSS = 6
 # Copies of the scene that are drawn from the object, at a pose that is known.
 PLANTED_COPIES = 4
-# Fewer scene points on the object determine nothing.
-MIN_POINTS = 100
 
 
 @dataclass(frozen=True)
@@ -237,7 +236,7 @@ def certified(
     """
     found = most_likely(obj, scene, start, scales, spacing, diagonal)
     of_pieces = _covariance(scene, found, diagonal, scales.width == 0)
-    if of_pieces is None or np.count_nonzero(found.on_object > 0.5) < MIN_POINTS:
+    if of_pieces is None or np.count_nonzero(found.on_object > 0.5) < MIN_POINTS // 2:
         return None
     off = _off_on_copies(obj, scene, found, scales, spacing, diagonal, seed)
     bias, spread = off.mean(0), np.cov(off.T)

@@ -26,6 +26,7 @@ from scenefuse.register.problem import SURFACE_POINTS, Problem
 from scenefuse.register.repetition import multiples, shifted, shifts_onto_itself, undecided_shift
 from scenefuse.register.score import (
     DISTINCT_ANGLE_DEG,
+    DISTINCT_SCALE_LOG,
     DISTINCT_SHIFT,
     SCORE_FRACTION,
     Hypothesis,
@@ -39,12 +40,6 @@ from scenefuse.register.uncertainty import Uncertainty, common_error, with_bendi
 START_FRACTION = DISTINCT_SHIFT
 # Hypotheses that are polished, and copies of the best that are.
 POLISHED_POSES = 4
-# Copies count as the best of their surroundings only: nearer ones would slide back to the pose that they are made of.
-COPY_SEPARATION_DEG = 25
-# The coarse search stays inside the scale prior; what it found at a bound may go on by this much (natural logarithm).
-PRIOR_SLACK_LOG = 0.15
-# The score is too coarse to choose between two poses in one valley; below this share, one is another's rival.
-MIN_SCORE_RATIO = 0.9
 # A refined pose beyond the alignment's uncertainty, which does not know how the models are bent, is near up to so many
 # times that.
 MAX_BENDING_FACTOR = 2.0
@@ -118,7 +113,8 @@ def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
     obj, scene = problem.surfaces(scale, fraction, SURFACE_POINTS)
     cell, reach = 2 * fraction * diagonal, 2 * START_FRACTION * diagonal
     return _Work(
-        replace(problem, scales=problem.scales.widened(PRIOR_SLACK_LOG)),
+        # What the search found at a bound of the scale prior may go on.
+        replace(problem, scales=problem.scales.widened(2 * DISTINCT_SCALE_LOG)),
         settings,
         obj,
         (
@@ -192,7 +188,8 @@ class _Work:
         ups = self.problem.known.ups
         copies = turned_copies(best.pose, self.obj, None if ups is None else ups[1], self.settings.turn_steps)
         scored = [Hypothesis(pose, "turned", self._score(pose, self.searched)) for pose in copies]
-        apart = [h for h in self.best_first([best, *scored], COPY_SEPARATION_DEG) if h.source == "turned"]
+        # Nearer copies would slide back to the pose that they are made of.
+        apart = [h for h in self.best_first([best, *scored], 3 * DISTINCT_ANGLE_DEG) if h.source == "turned"]
         return [self.refine(h.pose, "turned") for h in apart[:POLISHED_POSES]]
 
     def shifted(self, best: Hypothesis) -> list[Hypothesis]:
@@ -272,7 +269,7 @@ class _Work:
         near = alignment.agrees(ranked[0].pose, self.centre, diagonal, MAX_BENDING_FACTOR)
         if strays and near and _refuted(by_photos) and not _refuted(ranked[0]):
             return ranked, own, "near"
-        if own is not None and worth > MIN_SCORE_RATIO:
+        if own is not None and worth > 1 - self.settings.min_margin:
             own = own.unless_apart(ranked[0].pose, alignment.pose, self.centre, alignment.uncertainty)
         if strays or own is None or alignment.uncertainty.size(diagonal) < worth * own.size(diagonal):
             ranked, own = [by_photos, *ranked], alignment.uncertainty

@@ -1,36 +1,27 @@
 """Objects that repeat themselves, as stairs, colonnades and facades do: by which shifts, and whether what the object
 and a scene both show tells the shifted copies apart (method R8, R12)."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import map_coordinates, maximum_filter
 
+from scenefuse.cloud.strays import STRAY_PERCENT
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.depth_test import FreeSpace
 from scenefuse.geometry.icp import ScaleRange, refine_planes
 from scenefuse.geometry.surface import Surface
-from scenefuse.register.score import color_agreement, f_beta, worth
+from scenefuse.register.score import MIN_MARGIN, color_agreement, f_beta, worth
 
 # Edge of a voxel in spacings of the points; points agree within two edges.
 VOXEL_SPACINGS = 4 / 3
-# Cells of the autocorrelation at most; of more, the voxels are larger. Shifts below so many voxels are not looked for.
-MAX_CELLS, MIN_SHIFT_VOXELS = 1_000_000, 3
+# Shifts below so many voxels are not looked for.
+MIN_SHIFT_VOXELS = 3
 # A shift is looked at when this share of the object's voxels meet.
 MIN_MEETING = 0.3
-# Shifts that are looked at.
-MAX_PEAKS = 8
-# It repeats when it meets its shifted self about as closely as points of one surface lie apart, and on the way there so
-# much less: a plane that slides along itself does not repeat.
-MIN_SELF_AGREEMENT, MIN_CONTRAST = 0.96, 0.03
-# Where two clouds end along a direction, as percentiles: strays do not count.
-END_PERCENTILES = 1, 99
-# The part that both show must be so many periods long, and at least this share of what it is at the pose found: then
-# nothing distinctive in that can leave it unnoticed.
-MIN_PERIODS, MIN_OVERLAP_LEFT = 2, 0.5
+# The part that both show must be so many periods long: then nothing distinctive in it can leave it unnoticed.
+MIN_PERIODS = 2
 
 
 def shifts_onto_itself(obj: Surface, spacing: float) -> list[Array]:
@@ -65,37 +56,37 @@ def _repeats(obj: Surface, shift: Array, tau: float) -> bool:
     distance, nearest = obj.tree.query(obj.points[obj.queries], k=2, workers=threads())
     facing = np.abs((obj.normals[obj.queries] * obj.normals[nearest[:, 1]]).sum(1))
     usual = float((np.clip(1 - (distance[:, 1] / tau) ** 2, 0, 1) * facing).mean())
-    if overlap(obj, obj, Sim3(1.0, np.eye(3), shift), shift, tau).agreement < MIN_SELF_AGREEMENT * usual:
+    if overlap(obj, obj, Sim3(1.0, np.eye(3), shift), shift, tau) < (1 - MIN_MARGIN) * usual:
         return False
     there, half, quarter = (
-        overlap(obj, obj, Sim3(1.0, np.eye(3), part * shift), shift, tau / 2).agreement for part in (1.0, 0.5, 0.25)
+        overlap(obj, obj, Sim3(1.0, np.eye(3), part * shift), shift, tau / 2) for part in (1.0, 0.5, 0.25)
     )
-    return half < (1 - MIN_CONTRAST) * there or quarter < (1 - MIN_CONTRAST) * there
+    # A plane that slides along itself does not repeat.
+    return min(half, quarter) < (1 - MIN_MARGIN) * there
 
 
 def _peaks(obj: Surface, voxel: float) -> list[Array]:
     """Shifts (3,) at which many of an object's voxels meet others, most first; of each and its reverse, one."""
     axes = np.linalg.svd(obj.points - obj.points.mean(0), full_matrices=False)[2]
     points, normals = obj.points @ axes.T, obj.normals @ axes.T
-    voxel = max(voxel, float(np.cbrt(np.prod(2 * np.ptp(points, axis=0) + 4 * voxel) / MAX_CELLS)))
-    meeting, share = _autocorrelation(np.floor((points - points.min(0)) / voxel).astype(np.int64), normals)
+    most = 1_000_000  # cells; of more, the voxels are larger
+    voxel = max(voxel, float(np.cbrt(np.prod(2 * np.ptp(points, axis=0) + 4 * voxel) / most)))
+    meeting = _autocorrelation(np.floor((points - points.min(0)) / voxel).astype(np.int64), normals)
     size = np.array(meeting.shape)
-    high = np.argwhere((share == maximum_filter(share, 5, mode="wrap")) & (meeting > MIN_MEETING))
+    high = np.argwhere((meeting == maximum_filter(meeting, 5, mode="wrap")) & (meeting > MIN_MEETING))
     step = np.where(high > size // 2, high - size, high)
     ahead = (step[:, 0] > 0) | (step[:, 0] == 0) & ((step[:, 1] > 0) | (step[:, 1] == 0) & (step[:, 2] > 0))
     step = step[ahead & (np.linalg.norm(step, axis=1) >= MIN_SHIFT_VOXELS)]
     way = step[:, None] * np.linspace(0.1, 0.9, 9)[:, None]
-    least = map_coordinates(share, np.moveaxis(way, 2, 0), order=1, mode="grid-wrap").min(1)
-    step = step[share[tuple(step.T)] - least > MIN_CONTRAST]
-    order = np.argsort(-meeting[tuple(step.T)], kind="stable")[:MAX_PEAKS]
-    return [voxel * step[k] @ axes for k in order]
+    least = map_coordinates(meeting, np.moveaxis(way, 2, 0), order=1, mode="grid-wrap").min(1)
+    step = step[meeting[tuple(step.T)] - least > MIN_MARGIN]
+    return [voxel * step[k] @ axes for k in np.argsort(-meeting[tuple(step.T)], kind="stable")]
 
 
-def _autocorrelation(cells: NDArray[np.int64], normals: Array) -> tuple[Array, Array]:
-    """How much of a surface in cells (N, 3) with normals (N, 3) meets its shifted self, for every shift of a periodic
-    grid: as a share of all of it, and of what lies where both are."""
-    count = cells.max(0) + 1
-    shape = tuple(fft.next_fast_len(2 * int(n) + 4, real=True) for n in count)
+def _autocorrelation(cells: NDArray[np.int64], normals: Array) -> Array:
+    """Shares of a surface in cells (N, 3) with normals (N, 3) that meet its shifted self, for all shifts of a periodic
+    grid."""
+    shape = tuple(fft.next_fast_len(2 * int(n) + 4, real=True) for n in cells.max(0) + 1)
     flat, size = np.ravel_multi_index(tuple(cells.T), shape), int(np.prod(shape))
     filled = np.bincount(flat, minlength=size)
     spectrum = 0.0
@@ -104,24 +95,7 @@ def _autocorrelation(cells: NDArray[np.int64], normals: Array) -> tuple[Array, A
         wave = fft.rfftn(facing.reshape(shape).astype(np.float32), workers=threads())
         spectrum = spectrum + wave.real**2 + wave.imag**2
     meeting = fft.irfftn(_blurred(np.asarray(spectrum), shape), shape, workers=threads())
-    meeting /= meeting[0, 0, 0]
-    return meeting, meeting / np.maximum(_of_both((filled > 0).reshape(shape), count), MIN_MEETING / 3)
-
-
-def _of_both(filled: NDArray[np.bool_], count: NDArray[np.int64]) -> Array:
-    """The share of a box's voxels that lie in the box and in its shifted self, for every shift of a periodic grid."""
-    total = np.pad(filled, ((1, 0),) * 3).astype(np.float32)
-    for axis in range(3):
-        total = total.cumsum(axis)
-    bounds = []
-    for n, size in zip(count, filled.shape):
-        step = np.arange(size)
-        step = np.where(step > size // 2, step - size, step)
-        bounds.append((np.clip(step, 0, n), np.clip(n + step, 0, n)))
-    inside = np.zeros(filled.shape, np.float32)
-    for corner in np.ndindex(2, 2, 2):
-        inside += (-1) ** (3 - sum(corner)) * total[np.ix_(*(bounds[k][corner[k]] for k in range(3)))]
-    return np.sqrt(np.maximum(inside * np.roll(inside[::-1, ::-1, ::-1], 1, (0, 1, 2)), 0)) / total[-1, -1, -1]
+    return np.asarray(meeting / meeting[0, 0, 0])
 
 
 def _blurred(power: Array, shape: tuple[int, ...]) -> Array:
@@ -139,25 +113,10 @@ def _is_multiple(shift: Array, of: Array, tolerance: float) -> bool:
     return bool(np.linalg.norm(shift - count * of) < max(tolerance, 0.05 * float(np.linalg.norm(shift))))
 
 
-@dataclass(frozen=True)
-class Overlap:
-    """How well two surfaces agree where both are, along a direction.
-
-    Attributes:
-        agreement: two-way F, colours and free space, 0..1, as in a score.
-        length: of the part that both show, scene units.
-        same_ends: whether both end in the same places, to half the distance within which points agree.
-    """
-
-    agreement: float
-    length: float
-    same_ends: bool
-
-
 def overlap(
     obj: Surface, scene: Surface, pose: Sim3, shift: Array, tau: float, free_space: FreeSpace | None = None
-) -> Overlap:
-    """Compare an object and a scene where both are, along a direction of the object.
+) -> float:
+    """How well an object and a scene agree where both are, along a direction of the object: 0..1, as in a score.
 
     Args:
         obj: the object in its own frame.
@@ -181,13 +140,18 @@ def overlap(
     agreement *= 1.0 if color is None else 0.5 + 0.5 * color
     if free_space is not None:
         agreement *= 1 - (free_space.violation(pose.apply(obj.points[obj.queries])) or 0.0)
-    return Overlap(agreement, float(high - low), bool((np.abs(ends[0] - ends[1]) <= tau / 2).all()))
+    return agreement
+
+
+def ends_of(places: Array) -> Array:
+    """(2, ...) where points end, by their places (N, ...) along directions; strays do not count."""
+    return np.percentile(places, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
 
 
 def multiples(obj: Surface, shift: Array) -> list[Array]:
     """A shift (3,) repeated both ways, as far as the object reaches, shortest first."""
     along = obj.points @ (shift / np.linalg.norm(shift))
-    most = int(np.ptp(np.percentile(along, END_PERCENTILES)) / np.linalg.norm(shift))
+    most = int(np.ptp(ends_of(along)) / np.linalg.norm(shift))
     return [sign * k * shift for k in range(1, most + 1) for sign in (1, -1)]
 
 
@@ -220,17 +184,16 @@ def undecided_shift(
         free_space: space known to be empty, or None.
     """
     for shift in shifts:
-        period, found = pose.scale * float(np.linalg.norm(shift)), overlap(obj, scene, pose, shift, tau, free_space)
-        if found.same_ends:
-            continue
         of_object, of_scene = _places(obj, scene, pose, shift)[2]
+        if np.abs(of_object - of_scene).max() <= tau / 2:
+            continue
+        period, found = pose.scale * float(np.linalg.norm(shift)), overlap(obj, scene, pose, shift, tau, free_space)
         for step in multiples(obj, shift):
             moved = of_object + pose.scale * (step @ shift) / np.linalg.norm(shift)
             left = min(moved[1], of_scene[1]) - max(moved[0], of_scene[0])
-            if left < max(MIN_PERIODS * period, MIN_OVERLAP_LEFT * found.length):
+            if left < MIN_PERIODS * period:
                 continue
-            other = overlap(obj, scene, shifted(pose, step), shift, tau, free_space)
-            if other.agreement > (1 - margin) * found.agreement:
+            if overlap(obj, scene, shifted(pose, step), shift, tau, free_space) > (1 - margin) * found:
                 return period
     return None
 
@@ -239,4 +202,4 @@ def _places(obj: Surface, scene: Surface, pose: Sim3, shift: Array) -> tuple[Arr
     """Where along a direction of the object its points (N,) and the scene's (M,) lie, and both their ends (2, 2)."""
     along = pose.rotate(shift / np.linalg.norm(shift))
     places = pose.apply(obj.points) @ along, scene.points @ along
-    return *places, np.array([np.percentile(place, END_PERCENTILES) for place in places])
+    return *places, np.array([ends_of(place) for place in places])

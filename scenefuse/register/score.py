@@ -15,6 +15,8 @@ RECALL_WEIGHT = 2.0
 SCORE_FRACTION = 0.02
 # Noise of colours (standard deviation, 0..1) at least; those that vary less say nothing about the pose.
 MIN_COLOR_NOISE = 0.03
+# Relative lead of a score by which one pose is better than another.
+MIN_MARGIN = 0.04
 # Poses that differ by less than these are one: an angle, the scale, the centre as a share of the diagonal.
 DISTINCT_ANGLE_DEG, DISTINCT_SCALE_LOG, DISTINCT_SHIFT = 8.0, 0.06, 0.05
 

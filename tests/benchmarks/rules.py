@@ -188,7 +188,8 @@ def table(*, part: str, out: Path = Path("results/bench/rules.tsv"), table: Path
 
 
 def numbers(*, out: tuple[Path, ...], table: Path) -> None:
-    """Make the table of numbers: in how many trials a count changes, and by how much the other measures do at most.
+    """Make the table of numbers: in how many trials a count changes, how much the other measures change at most, and
+    whether the library still has the number.
 
     Args:
         out: the rows of `run --numbers`, a file a part.
@@ -197,22 +198,29 @@ def numbers(*, out: tuple[Path, ...], table: Path) -> None:
     lines = []
     for path in out:
         rows = pd.read_csv(path, sep="\t")
-        rows[["number", "change"]] = rows.rule.str.rsplit(" ", n=1, expand=True)
-        measures = rows.columns.drop(["rule", "trial", "kind", "reason", "cpu_s", "number", "change"], errors="ignore")
+        measures = rows.columns.drop(["rule", "trial", "kind", "reason", "cpu_s"], errors="ignore")
         counts = [name for name in measures if pd.api.types.is_integer_dtype(rows[name])]
-        others = [name for name in measures if name not in counts]
+        rows[["number", "change"]] = rows.rule.str.rsplit(" ", n=1, expand=True)
         whole = rows[rows.rule == NONE].set_index("trial")
         for number, own in rows[rows.rule != NONE].groupby("number", sort=False):
             line = {"part": path.stem, "number": number, "trials": own.trial.nunique()}
             for change in ("halved", "doubled"):
                 some = own[own.change == change].set_index("trial")
                 before = whole.loc[some.index]
-                line[f"counts differ, {change}"] = int((some[counts] != before[counts]).any(axis=1).sum())
-                most = (some[others] - before[others]).abs().max()
-                line |= {f"{name}, {change}": f"{value:.2g}" for name, value in most.items()}
-            lines.append(line)
+                line[f"{change}: counts differ in"] = int((some[counts] != before[counts]).any(axis=1).sum())
+                most = (some[measures.drop(counts)] - before[measures.drop(counts)]).abs().max().dropna()
+                line[f"{change}: changes of at most"] = ", ".join(f"{k} {v:.2g}" for k, v in most.items() if v > 0)
+            module, _, name = number.rpartition(".")
+            lines.append(line | {"now": "kept" if _is_there(f"scenefuse.{module}", name) else "gone"})
     pd.DataFrame(lines).to_csv(table, sep="\t", index=False)
     print(pd.DataFrame(lines).to_string())
+
+
+def _is_there(module: str, name: str) -> bool:
+    try:
+        return name in _literals(_imported(module))
+    except ImportError:
+        return False
 
 
 if __name__ == "__main__":
