@@ -60,9 +60,15 @@ class Photos:
 
     @staticmethod
     def of(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) -> "Photos | None":
-        """Those of a table's row; None for a cloud, a video, and photos that are yet to be made or cannot be read."""
+        """Those of a table's row, also those that the demo is yet to render; None for a cloud, a video, and photos that
+        cannot be read."""
         if not row.get("photos"):
             return None
+        if Path(row["photos"]).is_relative_to("results/demo") and not Path(row["photos"]).exists():
+            flight, orbit = settings["demo"]["flight"], settings["demo"]["orbit"]
+            count = flight["columns"] * flight["rows"] + flight["obliques"] if kind == "scene" else orbit["views"]
+            width = (flight if kind == "scene" else orbit)["width_px"]
+            return Photos(count, width, round(0.75 * width), kind == "scene")
         try:
             files = photo_files(Path(row["photos"]))
             with Image.open(files[0]) as first:

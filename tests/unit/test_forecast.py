@@ -10,7 +10,7 @@ from PIL.ExifTags import GPS, IFD, Base
 from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import StageError
 from scenefuse.photos.pictures import write_picture
-from scenefuse.report.forecast import disk_bytes, forecast_lines, job_seconds, read_forecast, write_forecast
+from scenefuse.report.forecast import Photos, disk_bytes, forecast_lines, job_seconds, read_forecast, write_forecast
 
 JOBS, MEMORY = {"map_scene_photos": 1800.0, "make_masks": 600.0}, {"map_scene_photos": 4000, "make_masks": 2000}
 
@@ -131,3 +131,14 @@ def test_a_forecast_is_kept_for_the_summary_beside_those_of_other_jobs(tmp_path)
     assert read_forecast(path) == {"benchmarks/a/x.tsv": 10.0, "benchmarks/b/x.tsv": 20.0}
     path.write_text("cut")
     assert read_forecast(path) == {}
+
+
+@pytest.mark.parametrize(("kind", "name", "count"), [("scene", "scene", 60), ("object", "house", 40)])
+def test_photos_that_the_demo_is_yet_to_render_are_counted(tmp_path, monkeypatch, kind, name, count):
+    monkeypatch.chdir(tmp_path)
+    row, shipped = {"photos": f"results/demo/demo/{name}/photos"}, read_settings(None)
+    planned = Photos.of(kind, row, shipped)
+    width = 800 if kind == "scene" else 640
+    assert planned == Photos(count, width, 3 * width // 4, kind == "scene")
+    assert job_seconds(kind, row, shipped) and disk_bytes(kind, row, shipped)
+    assert Photos.of(kind, {"photos": "elsewhere"}, shipped) is None
