@@ -53,10 +53,10 @@ STAGE_ROOM_KB, RUN_ROOM_KB = 16, 40_000
 
 
 def table_of(path: Path, rows: list[dict[str, str]]) -> None:
-    """Add rows to a table, in the place of those of the same stage and fault."""
+    """Add rows to a table, in the place of those of the same stage and fault, by stubs or real."""
     known = list(csv.DictReader(path.open(), delimiter="\t")) if path.is_file() else []
-    new = {(row["stage"], row["fault"]) for row in rows}
-    kept = [row for row in known if (row["stage"], row["fault"]) not in new] + rows
+    new = [tuple(row[name] for name in COLUMNS[:3]) for row in rows]
+    kept = [row for row in known if tuple(row[name] for name in COLUMNS[:3]) not in new] + rows
     kept.sort(key=lambda row: list(STAGES).index(row["stage"]))
     with path.open("w") as file:
         writer = csv.DictWriter(file, COLUMNS, delimiter="\t", lineterminator="\n")
