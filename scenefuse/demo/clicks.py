@@ -80,8 +80,7 @@ def click_points(*, name: str, cameras: Path, clicks: Path, settings: ClickSetti
             if point in names and seen[photo, k]:
                 x, y = np.clip(pixels[photo, k] + miss, 0, [capture.width, capture.height])
                 lines.append(f"{point}\t{capture.names[photo]}\t{x:.2f}\t{y:.2f}")
-    with atomic_file(clicks) as temporary:
-        temporary.write_text("\n".join(lines) + "\n")
+    _write(clicks, lines)
     print(f"{name}: {len(names)} points in {len(used)} photos", flush=True)
 
 
@@ -104,10 +103,13 @@ def click_object(*, truth: Path, clicks: Path, settings: PromptSettings, seed: i
     photo = max(masks, key=lambda name: np.count_nonzero(masks[name]))
     labels, pixels = clicks_on(masks[photo], settings, np.random.default_rng([seed, 4]))
     rows = [f"{label}\t{photo}.jpg\t{x:.1f}\t{y:.1f}" for label, (x, y) in zip(labels, pixels)]
-    lines = ["label\tphoto\tx_px\ty_px", *rows]
+    _write(clicks, ["label\tphoto\tx_px\ty_px", *rows])
+    print(f"{len(pixels)} clicks in {photo}.jpg", flush=True)
+
+
+def _write(clicks: Path, lines: list[str]) -> None:
     with atomic_file(clicks) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
-    print(f"{len(pixels)} clicks in {photo}.jpg", flush=True)
 
 
 def clicks_on(

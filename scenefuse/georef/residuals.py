@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pycolmap
 from numpy.typing import NDArray
 
@@ -77,35 +78,27 @@ def residuals_of(model: pycolmap.Reconstruction, found: Georeference, lengths: L
 def write_residuals(path: Path, found: Georeference, left: Residuals) -> None:
     """Write a line for every surveyed point and every photo with a position; cells without a value are empty."""
     rows: list[list[Any]] = []
+    yes_no = {True: "yes", False: "no"}
     if left.lengths is not None:
-        used = "yes" if found.placement.status == "scaled" else "no"
+        used = yes_no[found.placement.status == "scaled"]
         for name, error in zip(left.lengths.names, left.lengths.in_model - left.lengths.metres):
-            rows.append(["length", name, used, error, *[""] * 7])
+            rows.append(["length", name, used, error])
     if found.placement.status == "georeferenced":
-        for row, located_point in enumerate(found.located):
-            point, kind = located_point.point, "check point" if located_point.point.check else "control point"
-            used = "yes" if found.placement.used[row] else "no"
+        for row, (point, error) in enumerate(zip((s.point for s in found.located), left.points)):
+            kind, used = "check point" if point.check else "control point", yes_no[bool(found.placement.used[row])]
             counts = [len(point.clicks), left.points_px[row]]
-            rows.append([kind, point.name, used, _length(left.points[row]), *left.points[row], *point.sd_m, *counts])
-        for row, name in enumerate(found.gps.names):
-            chosen = found.placement.inliers
-            used = "yes" if len(chosen) and chosen[row] else "no"
-            error = left.cameras[row]
-            rows.append(["position", name, used, _length(error), *error, *found.gps.sd_m[row], "", ""])
+            rows.append([kind, point.name, used, _length(error), *error, *point.sd_m, *counts])
+        chosen = found.placement.inliers if len(found.placement.inliers) else np.zeros(len(found.gps.names), bool)
+        for name, is_used, error, sd_m in zip(found.gps.names, chosen, left.cameras, found.gps.sd_m):
+            rows.append(["position", name, yes_no[bool(is_used)], _length(error), *error, *sd_m])
+    table = pd.DataFrame(rows, columns=COLUMNS[: max(map(len, rows), default=0)]).reindex(columns=COLUMNS)
     with atomic_file(path) as temporary:
-        lines = ["\t".join(COLUMNS), *("\t".join(map(_cell, row)) for row in rows)]
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        table.astype({"photos": "Int64"}).to_csv(temporary, sep="\t", index=False, float_format="%.4f")
 
 
 def _length(error: Array) -> float:
     """Length of an error (3,) over its known coordinates; NaN where none is."""
     return float(np.sqrt(np.nansum(error**2))) if np.isfinite(error).any() else np.nan
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.4f}" if np.isfinite(value) else ""
-    return str(value)
 
 
 def georeference_report(found: Georeference, left: Residuals, cue: str, roll_deg: float) -> dict[str, Any]:

@@ -12,15 +12,13 @@ import numpy as np
 import pycolmap
 
 from scenefuse.core.transforms import Array
-from scenefuse.sfm.colmap import MIN_PHOTOS, ROBUST_PX, ROUGH_TOLERANCE, Freedom, adjust
+from scenefuse.sfm.colmap import MAX_REPROJECTION_ERROR_PX, MIN_PHOTOS, ROBUST_PX, ROUGH_TOLERANCE, Freedom, adjust
 
 # A richer lens has to predict held-out observations better by so many standard errors.
 MIN_GAIN = 3.0
 # And their median error has to fall by this share. What changes less is no better lens that matters, but tangential
 # distortion in the place of a principal point, which turns the cameras.
 MIN_MEDIAN_GAIN = 0.005
-# Errors beyond it count as this, so that one wrong match does not decide.
-MAX_ERROR_PX = 20.0
 # A principal point farther from the middle, as a share of the longer side, is no lens but a fit to something else.
 MAX_OFF_CENTRE = 0.1
 # Models by the number of their distortion parameters, the poorer ones as prefixes of the richer.
@@ -141,13 +139,14 @@ def enrich(camera: pycolmap.Camera, name: str) -> None:
 
 
 def _errors(model: pycolmap.Reconstruction, held: Held) -> Array:
-    """(N,) reprojection errors in pixels at held-out observations, at most MAX_ERROR_PX; that, where there is none."""
-    errors = np.full(len(held), MAX_ERROR_PX)
+    """(N,) reprojection errors in pixels at held-out observations, at most what COLMAP takes for no
+    outlier, so that one wrong match does not decide; that, where there is none."""
+    errors = np.full(len(held), MAX_REPROJECTION_ERROR_PX)
     for row, (point, photo, pixel) in enumerate(held):
         if point in model.points3D:
             seen = model.images[photo].project_point(model.points3D[point].xyz)
             if seen is not None:
-                errors[row] = min(MAX_ERROR_PX, float(np.linalg.norm(seen - pixel)))
+                errors[row] = min(MAX_REPROJECTION_ERROR_PX, float(np.linalg.norm(seen - pixel)))
     return errors
 
 
