@@ -12,8 +12,8 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from scenefuse.cloud.cloud_file import NEIGHBOURS
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing
-from scenefuse.cloud.strays import NEIGHBOURS
 from scenefuse.cloud.tiled_cloud import WHOLE, write_tiled
 from scenefuse.core.stage import StageError, quantity, read_json, scratch_directory, setting, threads, value, write_json
 from scenefuse.core.transforms import Array

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import map_coordinates, maximum_filter
 
-from scenefuse.cloud.strays import STRAY_PERCENT
+from scenefuse.cloud.cloud_file import STRAY_PERCENT
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.depth_test import FreeSpace
