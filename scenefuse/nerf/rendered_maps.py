@@ -138,11 +138,7 @@ def write_nerf(path: Path, nerf: Nerf, nerf_from_object: Sim3, maps: RenderedMap
         "log_gain": log_gain,
         "falloff": maps.falloff,
     }
-    try:
-        torch.save(saved, path)
-    except (OSError, RuntimeError) as error:  # PyTorch turns a failed write into a RuntimeError
-        why = " ".join(str(error).split())
-        raise StageError(f"{path.name} could not be written ({why}); check that the disk has room") from None
+    torch.save(saved, path)
 
 
 def read_nerf(stage: Path) -> dict[str, Any]:

@@ -328,7 +328,7 @@ def stages(*, finished: Path, table: Path, only: tuple[str, ...] = tuple(STAGES)
             job, _, cut = STAGES[stage]
             record, outputs = _recorded(work, job.split("-")[0])
             before = {name: text for name, text in results_in(work).items() if _within(name, outputs)}
-            happenings = {"no memory": contextlib.nullcontext()}
+            happenings: dict[str, contextlib.AbstractContextManager[None]] = {"no memory": contextlib.nullcontext()}
             spoiled = _input([str(work / name) for name in record.input], cut)
             if spoiled:
                 happenings |= {

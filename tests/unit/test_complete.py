@@ -125,6 +125,11 @@ def test_a_folder_without_photos_is_one_sentence(two_folders):
             "^close: masks: too few clicks",
         ),
         ("WorkflowError in file x, line 3:\\nno rows", "^no rows; all that Snakemake says: flight_completed"),
+        (
+            "ProtectedOutputException in rule a in file x, line 3:\\nWrite-protected output files for rule a:\\n"
+            "    output: b.ply\\nRemoving",
+            "^Write-protected output files for rule a: output: b.ply; all that",
+        ),
         ("error: the disk is full", "^the disk is full"),
         ("", "^Snakemake ended early"),
     ],
