@@ -192,7 +192,7 @@ def encoding(*, backward: bool) -> Row:
         taken.append(seconds_of(step, 20))
     off = float((results[0] - results[1]).abs().max() / results[0].abs().max())
     moved = count * levels * 8 * 8 * (2 if backward else 1) + 4 * weight.numel()
-    return Row("", "", off, 1e-4, *taken, f"{moved / taken[1] / 1e9:.0f} GB/s gathered")
+    return Row("", "", off, 1e-4, taken[0], taken[1], f"{moved / taken[1] / 1e9:.0f} GB/s gathered")
 
 
 def trained_sphere(device: str, steps: int) -> tuple[Any, Any, dict[str, float]]:
@@ -220,7 +220,7 @@ def training() -> Row:
     note = f"{here['psnr']:.2f} dB, {there['psnr']:.2f} dB; one more step on the GPU: "
     note += ", ".join(f"{name} {1000 * taken:.2f} ms" for name, taken in marginal.items())
     # Three standard deviations of what other seeds give (45.9, 45.1, 45.8 dB).
-    return Row("", "", abs(here["psnr"] - there["psnr"]), 1.2, *steps, note)
+    return Row("", "", abs(here["psnr"] - there["psnr"]), 1.2, steps[0], steps[1], note)
 
 
 def marching() -> Row:
@@ -236,13 +236,13 @@ def marching() -> Row:
         there, prior = jitter.to(device), no_prior(2304, torch.device(device))
 
         def step(given=given, occupancy=occupancy, there=there, prior=prior) -> Any:
-            return march(*given, occupancy, there, UNIFORM_SHARE, prior)
+            return march(given[0], given[1], occupancy, there, UNIFORM_SHARE, prior)
 
         results.append(step())
         taken.append(seconds_of(step, 20))
     same = set(results[0].ray.tolist()) == set(results[1].ray.tolist())
     off = (results[0].t - results[1].t.cpu()).abs() if same else torch.ones(1)
-    return Row("", "", float(off.quantile(0.999)), 1e-3, *taken, "" if same else "other rays hit the hull")
+    return Row("", "", float(off.quantile(0.999)), 1e-3, taken[0], taken[1], "" if same else "other rays hit the hull")
 
 
 def rendering() -> Row:
@@ -259,7 +259,9 @@ def rendering() -> Row:
         results.append(step())
         taken.append(seconds_of(step, 3))
     off = (results[0].color - results[1].color).abs().flatten().quantile(0.999)
-    return Row("", "", float(off), 5e-3, *taken, f"{everything.numel() / taken[1] / 1e6:.2f} million rays a second")
+    return Row(
+        "", "", float(off), 5e-3, taken[0], taken[1], f"{everything.numel() / taken[1] / 1e6:.2f} million rays a second"
+    )
 
 
 def stereo() -> Row:
@@ -281,7 +283,9 @@ def stereo() -> Row:
     here, there = (r.depth for r in results)
     off = float((np.abs(here - there) > 1e-3 * truth[4]).mean())
     right = [float((np.abs(r.depth - truth[4]) < 1e-3 * truth[4])[truth[4] > 0].mean()) for r in results]
-    return Row("", "", off, 0.01, *taken, f"within 0.1 % of the truth {right[0]:.3f}, {right[1]:.3f}; 0.307 MP")
+    return Row(
+        "", "", off, 0.01, taken[0], taken[1], f"within 0.1 % of the truth {right[0]:.3f}, {right[1]:.3f}; 0.307 MP"
+    )
 
 
 def photo_refinement() -> Row:
