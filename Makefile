@@ -22,7 +22,8 @@ test: .venv/tests
 	envs/browser.sh
 	pytest -n $(CORES) --dist loadfile --no-loadscope-reorder --durations 20
 
-# Faults of every stage, and what follows (docs/results/faults.tsv); the tiny workflow runs first. About an hour on two cores.
+# Faults of every stage, and what follows (docs/results/faults.tsv); the tiny workflow runs first. About two hours on two cores; full
+# disks and read-only folders only as root.
 test-faults: .venv/tests
 	snakemake --configfile tests/data/tiny.yaml --directory results/faults --cores $(CORES)
 	PYTHONPATH=.:tests python tests/benchmarks/faults.py workflow --table docs/results/faults.tsv
