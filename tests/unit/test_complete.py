@@ -188,6 +188,8 @@ def test_run_takes_all_cores_unless_somebody_says_how_many(two_folders, monkeypa
     assert started(monkeypatch, "-n") == ["-n", *own, "--cores", "all"]
     for words in (["--cores", "3"], ["-c3"], ["--profile", "slurm"], ["--jobs=9"]):
         assert started(monkeypatch, *words) == [*words, *own]
+    Path("config/config.yaml").write_text("# gpu: auto\n\n")
+    assert started(monkeypatch, "-n") == ["-n", "--cores", "all"]
 
 
 def test_the_help_of_run_is_one_screen(monkeypatch, capsys):
