@@ -13,9 +13,9 @@ demo: .venv/ready
 check: .venv/tests
 	pytest -n $(CORES) --dist loadfile -m "not process" $(if $(PART),--part $(PART)) tests/unit
 
-# Every path that a GPU takes beside its twin on the CPU, on a machine with PyTorch's CUDA build where nothing is installed.
+# Every path that a GPU takes beside its twin on the CPU, on a machine with PyTorch's CUDA build; gpu.py says what else.
 check-gpu:
-	PYTHONPATH=.:tests $(PYTHON) tests/benchmarks/gpu.py --table gpu.tsv
+	PYTHONPATH=.:tests $(PYTHON) tests/benchmarks/gpu.py --table results/gpu.tsv
 
 # All tests: those of whole workflows first.
 test: .venv/tests

@@ -97,7 +97,7 @@ def _settings_files() -> tuple[list[Path], list[str]]:
 
 
 def _export() -> None:
-    """make what is handed over of finished objects: surfaces, drawings, cameras"""
+    """make what is handed over of finished objects: surfaces, drawings, cameras, tiles, a PDF"""
     parser = argparse.ArgumentParser(
         prog="scenefuse export",
         description="Make surfaces, drawings, cameras, tiles and a PDF of finished objects, shown in the report."

@@ -94,7 +94,7 @@ def _accuracy(has: dict[str, Any], unit: str) -> dict[str, str]:
     ]
     found = [f"standard deviation of a point {' and '.join(parts)}"] if parts else []
     if has.get("scale_sd_log"):
-        found.append(f"its scale is known to {percent(has['scale_sd_log'])}")
+        found.append(f"its scale in the scene is known to {percent(has['scale_sd_log'])}")
     return {"Accuracy": "; ".join(found)} if found else {}
 
 
@@ -103,7 +103,7 @@ def _next(has: dict[str, Any]) -> dict[str, str]:
     parts = []
     if has.get("stations"):
         shows = (
-            f": this would show {percent(has['stations_show'])} of what photos can still show"
+            f": this would show {percent(has['stations_show'])} of what no photo saw or photos dispute"
             if "stations_show" in has
             else ""
         )
@@ -147,7 +147,10 @@ def scene_facts(row: Row) -> dict[str, str]:
     if errors:
         facts["Residuals"] = "; ".join(errors)
     if "completed_points" in has:
-        facts["File"] = f"scenes/{has['scene']}/completed.ply, completed.copc.laz"
+        file = f"scenes/{has['scene']}/completed"
+        facts["File"] = f"{file}.copc.laz" + (
+            f" in the CRS; {file}.ply from a local origin" if "crs" in has else f", {file}.ply"
+        )
     return _capital(facts)
 
 

@@ -29,7 +29,7 @@ from scenefuse.report.values import Fields, find, number, unit_of
 
 WIDTH = 100
 # Facts that the one screen of summary.txt leaves to the page.
-ON_PAGE_ONLY = {"Points", "Photos", "Residuals"}
+ON_PAGE_ONLY = {"Points", "Photos"}
 # Quantities of a stage that are worth a line: what it chose where it had a choice, and what it noted.
 CHOICES = ("pose_source", "backend", "method", "mode", "up_cue")
 NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")

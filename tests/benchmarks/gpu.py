@@ -5,7 +5,7 @@ PYTHONPATH=.:tests python3 tests/benchmarks/gpu.py --table gpu.tsv --object resu
 
 Beside PyTorch and Triton it needs NumPy, SciPy, Numba, OpenCV, PyYAML, jsonschema and tyro; pycolmap (pycolmap-cuda12
 for patch-match, with X11's libraries) and pyproj for photos, transformers for SAM 2. Without a GPU both sides
-run on the CPU, which checks the checks.
+run on the CPU, which checks the checks, and the end is an error.
 """
 
 import dataclasses
@@ -102,7 +102,10 @@ def gpu(
     lines = [header, *("\t".join(map(shown, row.cells())) for row in rows)]
     print("\n".join(lines), flush=True)
     if table is not None:
+        table.parent.mkdir(parents=True, exist_ok=True)
         table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    if not HAVE_GPU:
+        raise StageError("PyTorch sees no GPU: the CPU was compared with itself")
     failed = [row.check for row in rows if row.agree != "yes" and not row.note.startswith("left out")]
     if failed:
         raise StageError(f"CPU and GPU do not agree, or the GPU fails, in: {', '.join(failed)}")

@@ -217,7 +217,7 @@ def test_the_text_says_that_ground_was_left_in(results):
 def test_the_text_says_what_psnr_was_measured_on_and_what_the_completed_scene_holds(results):
     text = " ".join((summarise(results, ["house", "balloon"]) / "details.txt").read_text().split())
     assert "PSNR 27.5 dB, measured on training photos" in text and "held-out" not in text
-    assert "Completed with house; 5,030 points" in text and "completed.ply, completed.copc.laz" in text
+    assert "Completed with house; 5,030 points" in text and "scenes/demo/completed.copc.laz, scenes/demo/completed.ply" in text
     assert "completed.copc" not in (summarise(results) / "details.txt").read_text()
 
 
@@ -462,7 +462,7 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
         "11.4 m × 9.96 m, 8.10 m high",
         "98.2 % is there, 1.8 % is missing: 1.0 % seen by no photo, 0.8 % where photos disagree",
         "Standard deviation of a point 7.20 mm on the object and 13.1 mm in the scene",
-        "Photograph it from 3 places (objects/house/next_photos.csv): this would show 77 % of what photos",
+        "Photograph it from 3 places (objects/house/next_photos.csv): this would show 77 % of what no photo",
     ):
         assert sentence in " ".join(text.split()) and sentence in card, sentence
     assert "Not added to the scene: weak. Perhaps it is not in this scene" in text
