@@ -275,7 +275,7 @@ def _points(
         if off:
             notes = (
                 f"the clicks on {len(off)} of {len(names)} points miss each other by more than {max_residual_px:g} px"
-                f" ({', '.join(off)}): these points say how far the object reaches, and do not prompt SAM 2",
+                f" ({', '.join(off)}): these points only say how far the object reaches",
             )
     if len(points) < SUFFICIENT_CLICKS:
         wrong = f" ({'; '.join(left_out)})" if left_out else ""

@@ -83,7 +83,7 @@ def surface_facts(folder: Path) -> dict[str, str]:
         f"{percent(value(found, kind))} {kind}" for kind in ("measured", "unconfirmed", "bridged", "open")
     )
     drawings = f", objects/{folder.name}/drawings/drawings.pdf" if (folder / "drawings").is_dir() else ""
-    return {"Mesh": f"{shares}; objects/{folder.name}/surface.glb{drawings}"}
+    return {"Mesh": f"With the ground around it {shares}; objects/{folder.name}/surface.glb{drawings}"}
 
 
 def _accuracy(has: dict[str, Any], unit: str) -> dict[str, str]:
