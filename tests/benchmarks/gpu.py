@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerf import by_both, training_seconds
+from benchmarks.nerf import by_both, training_seconds
 from support.painted_sphere import photos_of, sphere_views, sphere_volume
 from support.sideways_video import sideways_video
 from support.textured_plane import plane_views, speckled, wrong_depths
@@ -436,7 +436,7 @@ def lego_to_30_db(data: Path) -> Row:
     import io
     import re
 
-    from lego import lego
+    from benchmarks.lego import lego
 
     said = io.StringIO()
     with contextlib.redirect_stdout(said):
