@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -37,7 +37,7 @@ from scenefuse.nerf.render import UNIFORM_SHARE, march, no_prior, render_view
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, keep_memory, new_nerf, train
 
 HAVE_GPU = torch.cuda.is_available()
-GPU = "cuda" if HAVE_GPU else "cpu"
+GPU: Literal["cpu", "cuda"] = "cuda" if HAVE_GPU else "cpu"
 ROOT = Path(__file__).resolve().parents[2]
 
 

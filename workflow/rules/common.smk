@@ -38,7 +38,7 @@ for folder in filter(os.path.exists, (os.getcwd(), ".snakemake", "results")):
     if not os.access(folder, os.W_OK):
         sys.exit(f"error: {folder} cannot be written to; check who may write there")
 if shutil.disk_usage(os.getcwd()).free < MIN_FREE_BYTES:
-    sys.exit("error: " + DISK_FULL.format(f" ({os.getcwd()})"))
+    sys.exit(f"error: {DISK_FULL.format(f' ({os.getcwd()})')}")
 ROOT = Path(str(workflow.current_basedir)).parents[1]
 if not (ROOT / "scripts").is_dir():
     ROOT = SHIPPED
@@ -304,6 +304,21 @@ def of_objects(path):
     """Input function: a file of every object of the scene."""
     return lambda wildcards: [
         f"results/objects/{name}/{path}" for name in objects_in(wildcards)
+    ]
+
+
+def finished_folders(wildcards):
+    """The result folders of the objects of a scene that are fused; those that failed are left out."""
+    folders = object_folders(wildcards)
+    return [folder for folder in folders if Path(folder, "fused.ply").is_file()]
+
+
+def finished_in(path):
+    """Input function: a file of every fused object of the scene; `undistorted` of those with photos."""
+    return lambda wildcards: [
+        f"{folder}/{path}"
+        for folder in finished_folders(wildcards)
+        if path != "undistorted" or OBJECTS[Path(folder).name].get("photos")
     ]
 
 

@@ -5,16 +5,6 @@
 #           results/scenes/{scene}/cameras/, tiles/
 
 
-def finished_in(path):
-    """Input function: a file or folder of every object of the scene that is fused; those that failed are left out."""
-    return lambda wildcards: [
-        f"results/objects/{name}/{path}"
-        for name in objects_in(wildcards)
-        if Path(f"results/objects/{name}/fused.ply").is_file()
-        and not (path == "undistorted" and not OBJECTS[name].get("photos"))
-    ]
-
-
 rule make_surface:
     """The surface of a completed object: measured, bridged and open parts told apart (F7)."""
     input:
@@ -99,9 +89,7 @@ rule export_cameras:
         mem_mb=2000,
         runtime=lambda wildcards, attempt: 10 * attempt,
     params:
-        objects=lambda wildcards: [
-            path.rstrip("/") for path in finished_in("")(wildcards)
-        ],
+        objects=finished_folders,
         photos=options_of("scene_workspace"),
         script=script("surface/export_cameras.py"),
         code=code("surface/export_cameras.py"),
@@ -131,9 +119,7 @@ rule make_tiles:
         mem_mb=by_size(2000, cloud=10),
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
-        objects=lambda wildcards: [
-            path.rstrip("/") for path in finished_in("")(wildcards)
-        ],
+        objects=finished_folders,
         script=script("surface/make_tiles.py"),
         code=code("surface/make_tiles.py"),
     message:
