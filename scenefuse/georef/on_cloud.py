@@ -26,6 +26,8 @@ from scenefuse.georef.residuals import Georeference
 from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.workspace import View, posed_images, view_of
 
+# ICP goes on until a round of steps moves no point by more than this share of the model's extent.
+MAX_STEP = 1e-3
 # Points of a cloud that a model is compared with or laid on, and that are projected into all photos.
 MAX_COMPARED, MAX_PROJECTED = 200_000, 10_000
 # A cloud in other coordinates than the cameras has a smaller share of its points in their pictures than the first, or
@@ -220,8 +222,7 @@ def _onto(cloud: Array, own: Array, name: str) -> Sim3:
             " needed; give a cloud that shows more of what the photos do"
         )
     moved = Sim3(1.0, np.eye(3), np.array([0.0, 0.0, _height_above(cloud, own[over])]))
-    # Until a round of steps moves no point by more than a thousandth of the model's extent.
-    stays = 1e-3 * float(np.linalg.norm(np.ptp(own, axis=0)))
+    stays = MAX_STEP * float(np.linalg.norm(np.ptp(own, axis=0)))
     for _ in range(10):
         here = moved.apply(own)
         here = here[_over(cloud, here)]

@@ -17,6 +17,8 @@ from scenefuse.register.score import SCORE_FRACTION
 from scenefuse.register.uncertainty import Uncertainty
 from scenefuse.sfm.gravity import UNSURE_CUES
 
+# Points on a line leave the turn about it open: below this ratio of the two largest RMS extents no pose is sought.
+MIN_BREADTH = 1e-3
 # Points kept of either cloud. The polish queries a quarter of them; the search, in which poses differ grossly, keeps a
 # half and queries a tenth.
 SURFACE_POINTS = 12_000
@@ -137,7 +139,7 @@ def check_extent(cloud: Cloud, name: str) -> None:
     """StageError where a cloud's points lie in one place or along one line: nothing fixes a pose of it then."""
     centred = cloud.points - cloud.points.mean(0)
     extents = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0))
-    if cloud.diagonal == 0 or extents[1] <= 1e-3 * extents[2]:
+    if cloud.diagonal == 0 or extents[1] <= MIN_BREADTH * extents[2]:
         where = "in one place" if cloud.diagonal == 0 else "along one line"
         raise StageError(f"all {len(cloud)} points of {name} lie {where}: a registration needs a surface")
 

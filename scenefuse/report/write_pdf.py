@@ -66,7 +66,6 @@ class _Page(FPDF):
 
     def __init__(self, project: str) -> None:
         super().__init__()
-        logging.getLogger("fpdf").setLevel(logging.ERROR)
         logging.getLogger("fontTools").setLevel(logging.ERROR)
         fonts = Path(matplotlib.get_data_path()) / "fonts/ttf"
         self.add_font("sans", "", fonts / "DejaVuSans.ttf")

@@ -81,10 +81,10 @@ def _points_tile(points: Cloud, chosen: NDArray[np.int64], name: str, folder: Pa
     here, others = chosen[:TILE_SIZE], chosen[TILE_SIZE:]
     write_points(folder / f"{name}.glb", points[here], {})
     low, high = points.points[chosen].min(0), points.points[chosen].max(0)
-    tile = _tile(low, high, f"{name}.glb", 0.0)
+    # Points of a surface that is as wide as the tile lie so far apart.
+    apart = float((high - low).max() / np.sqrt(TILE_SIZE)) if len(others) else 0.0
+    tile = _tile(low, high, f"{name}.glb", apart)
     if len(others):
-        # Points of a surface that is as wide as the tile lie so far apart.
-        tile |= _tile(low, high, f"{name}.glb", float((high - low).max() / np.sqrt(TILE_SIZE)))
         octant = (points.points[others] > (low + high) / 2) @ [1, 2, 4]
         parts = [(k, others[octant == k]) for k in range(8)]
         tile["children"] = [_points_tile(points, part, f"{name}{k}", folder) for k, part in parts if len(part)]
