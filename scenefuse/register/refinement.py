@@ -26,7 +26,6 @@ from scenefuse.register.problem import SURFACE_POINTS, Problem
 from scenefuse.register.repetition import multiples, shifted, shifts_onto_itself, undecided_shift
 from scenefuse.register.score import (
     DISTINCT_ANGLE_DEG,
-    DISTINCT_SCALE_LOG,
     DISTINCT_SHIFT,
     SCORE_FRACTION,
     Hypothesis,
@@ -40,6 +39,9 @@ from scenefuse.register.uncertainty import Uncertainty, common_error, with_bendi
 START_FRACTION = DISTINCT_SHIFT
 # Hypotheses that are polished, and copies of the best that are.
 POLISHED_POSES = 4
+# The coarse search stays inside the scale prior; what it found at a bound may go on by this much (natural logarithm).
+# With 0.12 a planted gate ended at the edge.
+PRIOR_SLACK_LOG = 0.15
 # A refined pose beyond the alignment's uncertainty, which does not know how the models are bent, is near up to so many
 # times that.
 MAX_BENDING_FACTOR = 2.0
@@ -113,8 +115,7 @@ def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
     obj, scene = problem.surfaces(scale, fraction, SURFACE_POINTS)
     cell, reach = 2 * fraction * diagonal, 2 * START_FRACTION * diagonal
     return _Work(
-        # What the search found at a bound of the scale prior may go on.
-        replace(problem, scales=problem.scales.widened(2 * DISTINCT_SCALE_LOG)),
+        replace(problem, scales=problem.scales.widened(PRIOR_SLACK_LOG)),
         settings,
         obj,
         (
