@@ -1,4 +1,7 @@
-"""The wheel: beside the library, the files of the workflow, as scenefuse/shipped/; pyproject.toml has all the rest."""
+"""The wheel: beside the library, the files of the workflow, as scenefuse/shipped/; pyproject.toml has all the rest.
+
+The demo is not in it: neither its package nor its tables.
+"""
 
 from pathlib import Path
 from shutil import copy2
@@ -8,7 +11,6 @@ from setuptools.command.build_py import build_py
 
 NAMES = ("README.md", "config.yaml", "paper.yaml", "presets", "examples")
 CONFIG = tuple(f"config/{name}" for name in NAMES)
-"""Not the demo's tables: an installed workflow works on those of a user."""
 DOCUMENTS = tuple(path.as_posix() for path in sorted(Path("docs").rglob("*.md")))
 """Messages name some of them."""
 SHIPPED = ("Snakefile", "workflow", "scripts", "profiles", "envs", *CONFIG, *DOCUMENTS)
@@ -19,9 +21,10 @@ class WithWorkflow(build_py):
 
     def run(self) -> None:
         """Build the library, then copy."""
-        super().run()
         if self.editable_mode:
-            return
+            return super().run()
+        self.packages.remove("demo")
+        super().run()
         for start in map(Path, SHIPPED):
             for path in [start, *start.rglob("*")]:
                 if path.is_file() and "__pycache__" not in path.parts:

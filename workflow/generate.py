@@ -9,9 +9,9 @@ from typing import Any
 
 import yaml
 
-from scenefuse.config import schema
 from workflow import documents
 from workflow.documents import ROOT
+from workflow.settings import schema
 
 SCHEMA = ROOT / "workflow/schemas/config.schema.yaml"
 PAGE = ROOT / "config/README.md"
@@ -76,7 +76,7 @@ def fresh() -> dict[Path, str]:
     """The files as they should be."""
     pages = documents.fresh()
     before, rest = pages[PAGE].split(START)
-    note = "# Written by `make docs` from the settings dataclasses (scenefuse/config.py); do not edit.\n"
+    note = "# Written by `make docs` from the settings dataclasses (workflow/settings.py); do not edit.\n"
     text = note + yaml.safe_dump(schema(), sort_keys=False, allow_unicode=True, width=110)
     return pages | {SCHEMA: text, PAGE: before + tables() + rest.split(END)[1]}
 

@@ -55,7 +55,7 @@ def setting(
 ) -> Any:
     """A field of a settings dataclass that a settings file may set; a field without it is a constant of the algorithm.
 
-    The docstring below the field describes it. Schema and tables are generated from both (`scenefuse.config`).
+    The docstring below the field describes it. Schema and tables are generated from both (`workflow.settings`).
 
     Args:
         default: its value where nobody sets it.

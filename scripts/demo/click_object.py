@@ -1,7 +1,7 @@
 """Click an object's landmarks in photos of the demo."""
 
+from demo.clicks import click_object
 from scenefuse.core.stage import run
-from scenefuse.demo.clicks import click_object
 
 if __name__ == "__main__":
     run(click_object)

@@ -1,7 +1,7 @@
 """Render the demo's mapping flight."""
 
+from demo.capture import render_scene
 from scenefuse.core.stage import run
-from scenefuse.demo.capture import render_scene
 
 if __name__ == "__main__":
     run(render_scene)

@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage
 
+from demo.clicks import PromptSettings, clicks_on, random_misses
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, read_json, run, value
 from scenefuse.core.transforms import Array
-from scenefuse.demo.clicks import PromptSettings, clicks_on, random_misses
 from scenefuse.geometry.visual_hull import Mask, mask_iou
 from scenefuse.marks.clicks import Click, Clicks
 from scenefuse.masks import segmentation

@@ -18,9 +18,9 @@ import numpy as np
 import pandas as pd
 import pycolmap
 
+from demo.capture import OrbitSettings, render_object
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import quantity, run, write_json
-from scenefuse.demo.capture import OrbitSettings, render_object
 from scenefuse.metrics.truth import Cameras, read_cameras, read_mesh, sample_surface, visible
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.refine_depth import refine_depth

@@ -19,11 +19,11 @@ import open3d as o3d
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
+from demo import bodies, textures
+from demo.capture import render
+from demo.world import World, build_world, openness
 from scenefuse.core.stage import run, threads, value
 from scenefuse.core.transforms import Array, fit_sim3, look_at
-from scenefuse.demo import bodies, textures
-from scenefuse.demo.capture import render
-from scenefuse.demo.world import World, build_world, openness
 from scenefuse.metrics.truth import Cameras, pinhole
 from scenefuse.nerf.prior_training import optimise, predict, prepare_torch
 from scenefuse.paper.estimate_as_paper import chained, trajectory_error

@@ -20,12 +20,12 @@ import pyproj
 import yaml
 from plyfile import PlyData
 
+from demo.world import ORIGIN
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.settings import ROOT
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array
-from scenefuse.demo.world import ORIGIN
 from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.metrics.truth import read_cameras

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from support.planted import SHAPES
 
+from demo.objects import Part, box, grid, join
 from scenefuse.core.transforms import Array, Sim3, look_at
-from scenefuse.demo.objects import Part, box, grid, join
 
 Kind = Literal["grid", "orbit", "row"]
 Rows = NDArray[np.int64]

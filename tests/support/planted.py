@@ -9,10 +9,10 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from demo import objects
+from demo.objects import Part, blob, box, grid, join, lathe, tube
 from scenefuse.cloud.clouds import Cloud, concatenate
 from scenefuse.core.transforms import Sim3, rotation_angle_deg, rotation_between
-from scenefuse.demo import objects
-from scenefuse.demo.objects import Part, blob, box, grid, join, lathe, tube
 from scenefuse.geometry.depth_test import FreeSpace, without_edges
 from scenefuse.photos.workspace import View
 

@@ -10,10 +10,10 @@ import open3d as o3d
 import pytest
 from PIL import Image
 
+from demo import capture, clicks, textures
+from demo.bodies import DRONE, IDEAL, PHONE, Body, Exposure, blur_kernel, draw_exposure, expose, vignetting
+from demo.world import ORIGIN, World, build_world, openness
 from scenefuse.core.stage import StageError, manifest, read_json, value
-from scenefuse.demo import capture, clicks, textures
-from scenefuse.demo.bodies import DRONE, IDEAL, PHONE, Body, Exposure, blur_kernel, draw_exposure, expose, vignetting
-from scenefuse.demo.world import ORIGIN, World, build_world, openness
 from scenefuse.marks.clicks import read_points
 from scenefuse.metrics.truth import Cameras, pinhole, read_cameras, visible
 from scenefuse.photos.geodesy import LocalFrame

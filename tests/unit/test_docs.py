@@ -12,7 +12,7 @@ from workflow import documents
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "config").rglob("*.md")])
-PARTS = ("scenefuse", "scripts", "workflow", "tests", "docs", "config", "envs", "profiles")
+PARTS = ("scenefuse", "demo", "scripts", "workflow", "tests", "docs", "config", "envs", "profiles")
 FILES = ("ply", "laz", "json", "tsv", "png", "smk")
 # What changed names the old along with the new.
 CURRENT = [page for page in PAGES if page.name != "CHANGELOG.md"]

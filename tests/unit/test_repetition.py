@@ -8,9 +8,9 @@ import open3d as o3d
 import pytest
 from support.planted import errors
 
+from demo.objects import box, join, sheet
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
-from scenefuse.demo.objects import box, join, sheet
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import prepare
 from scenefuse.register.decision import FineSettings

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.planted import errors
 
+from demo.objects import box, join, sheet
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
-from scenefuse.demo.objects import box, join, sheet
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, estimates, prior

@@ -13,8 +13,6 @@ LIBRARY = ROOT / "scenefuse"
 PACKAGES = ["core", "cloud", "photos", "marks", "geometry", "sfm", "georef", "mvs", "masks", "nerf", "crop"]
 PACKAGES += ["register", "fuse", "surface", "metrics", "report", "paper", "pick", "two_clouds"]
 MAY_IMPORT = {name: set(PACKAGES[: PACKAGES.index(name) + 1]) for name in PACKAGES}
-# The demo is outside the library: it writes captures and their truth, and no package imports it.
-MAY_IMPORT |= {"demo": {"core", "cloud", "photos", "metrics", "demo"}, "config": {*PACKAGES, "demo"}}
 MAY_IMPORT |= {"new_project": {"core", "cloud", "photos"}, "complete": {"core", "report", "new_project"}}
 MAY_IMPORT |= {"command_line": {*PACKAGES, "new_project", "complete"}}
 MAY_IMPORT |= {"__main__": {"command_line"}}
@@ -57,6 +55,12 @@ def test_imports_run_from_later_packages_to_earlier_ones():
             if not allowed and module.removeprefix("scenefuse.") not in MAY_IMPORT[here]:
                 backwards.append(f"{path.relative_to(ROOT)} imports {module}")
     assert backwards == []
+
+
+def test_the_demo_stands_on_a_few_packages_and_no_package_imports_it():
+    used = {name for path in (ROOT / "demo").glob("*.py") for name in imported(path) if name.startswith("scenefuse")}
+    assert {part(name) for name in used} <= {"core", "photos", "metrics"}
+    assert [str(path) for path in modules() for name in imported(path) if name.split(".")[0] == "demo"] == []
 
 
 def test_the_library_never_sees_snakemake():

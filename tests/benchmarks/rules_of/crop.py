@@ -22,13 +22,13 @@ from rules import Rule
 from scipy.spatial import cKDTree
 from support.planted import plant
 
+from demo.clicks import PromptSettings, clicks_on
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop import crop_cloud, crop_scene
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import CropInputs
-from scenefuse.demo.clicks import PromptSettings, clicks_on
 from scenefuse.metrics.evaluate_object import around_object, read_object_truth
 from scenefuse.photos.workspace import read_views
 

@@ -10,10 +10,10 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
+from demo.objects import OBJECTS, Part, blob, box, grid, rotation, tube
+from demo.textures import Material, noise_at, path_distance
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
-from scenefuse.demo.objects import OBJECTS, Part, blob, box, grid, rotation, tube
-from scenefuse.demo.textures import Material, noise_at, path_distance
 
 # Height of the ground at east, north.
 Height = Callable[[Array, Array], Array]
@@ -33,7 +33,7 @@ class World:
     Attributes:
         vertices: (V, 3) float32.
         triangles: (T, 3) int32.
-        materials: (T,) int32, see `scenefuse.demo.textures`.
+        materials: (T,) int32, see `demo.textures`.
         owners: (T,) int32: 0 terrain and clutter, 1 + k the k-th of `names`.
         names: the objects.
         frames: (1 + objects, 5) x, y, z, cos yaw, sin yaw of each owner's frame in the world.

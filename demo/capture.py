@@ -11,11 +11,11 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
+from demo import bodies, textures
+from demo.bodies import Body, Exposure, draw_exposure, expose
+from demo.world import MAPPED, ORIGIN, SUN, World, build_world, openness
 from scenefuse.core.stage import StageError, atomic_directory, quantity, setting, threads, write_json
 from scenefuse.core.transforms import look_at
-from scenefuse.demo import bodies, textures
-from scenefuse.demo.bodies import Body, Exposure, draw_exposure, expose
-from scenefuse.demo.world import MAPPED, ORIGIN, SUN, World, build_world, openness
 from scenefuse.metrics.truth import Cameras, cameras_json, pinhole
 
 
@@ -302,7 +302,7 @@ def render(
         cameras: from where.
         photo: which of them.
         in_cam: (H * W * S, 2) the rays of `Cameras.rays`, S samples for each pixel.
-        open_sky: (V,) of `scenefuse.demo.world.openness`.
+        open_sky: (V,) of `demo.world.openness`.
         haze: share of white in the sky.
 
     Returns:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scenefuse.demo.textures import Material, noise_at
+from demo.textures import Material, noise_at
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Part:
     Attributes:
         vertices: (V, 3) float64, metres.
         triangles: (T, 3) int64 indices, counter-clockwise from outside.
-        material: number of the material, see `scenefuse.demo.textures`.
+        material: number of the material, see `demo.textures`.
     """
 
     vertices: NDArray[np.float64]

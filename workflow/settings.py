@@ -1,7 +1,7 @@
 """All settings: which section of a settings file fills which dataclass, and the JSON schema that follows from them.
 
-A dataclass of a stage is the one source of its settings: type, default, unit, bounds and description. Here stands only
-where in a settings file each is found, and what differs between scene and object.
+A dataclass of a stage, or of the demo, is the one source of its settings: type, default, unit, bounds and description.
+Here stands only where in a settings file each is found, and what differs between scene and object.
 """
 
 import ast
@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from demo.bodies import Kind
+from demo.capture import FlightSettings, OrbitSettings
 from scenefuse.core.stage import setting
 from scenefuse.crop.crop_cloud import CropSettings
-from scenefuse.demo.bodies import Kind
-from scenefuse.demo.capture import FlightSettings, OrbitSettings
 from scenefuse.fuse.modes import FusionSettings
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.masks.segmentation import MaskSettings

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from demo import textures
 from scenefuse.core.stage import quantity
 from scenefuse.core.transforms import Array
-from scenefuse.demo import textures
 from scenefuse.metrics.truth import Cameras
 
 Kind = Literal["real", "ideal"]

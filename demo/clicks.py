@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from demo.world import build_world
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.demo.world import build_world
 from scenefuse.metrics.truth import read_cameras, visible
 from scenefuse.photos.pictures import read_mask
 
