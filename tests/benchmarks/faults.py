@@ -110,7 +110,7 @@ def workflow(*, table: Path, only: tuple[str, ...] = tuple(STAGES), faults: tupl
 
 def _wanted(fault: str, faults: tuple[str, ...]) -> bool:
     """Whether a fault is asked for, and can be made: only root can mount a disk."""
-    can = os.geteuid() == 0 or fault not in ("full disk", "read-only results")
+    can = os.geteuid() == 0 or not fault.startswith(("full disk", "read-only"))
     return can and (not faults or fault in faults)
 
 
@@ -203,6 +203,14 @@ def _no_writing(run: StubRun, job: str) -> str:
         said = _said(run.run().stdout)
     run.plant(job, "")
     return said
+
+
+def _folder_of_another(run: StubRun, job: str) -> str:
+    """The folder is read-only, and empty."""
+    for folder in {(run.path / path).parent for path in run.outputs_of(job)}:
+        shutil.rmtree(folder)
+        folder.mkdir()
+    return _no_writing(run, job)
 
 
 def _stopped(run: StubRun, job: str) -> str:
@@ -309,7 +317,11 @@ EXTRA: dict[str, dict[str, Callable[[StubRun, str], str]]] = {
     "stage-4": {"Ctrl-C": _interrupted, "SIGTERM of Snakemake": _stopped, "output deleted": _deleted_output},
     "masks": {"Ctrl-C": _interrupted, "two runs in one folder": _two_runs},
     "registration": {"clock set back": _clock_set_back, "output deleted": _deleted_output},
-    "fusion": {"clock set back": _clock_set_back, "another umask": _other_umask},
+    "fusion": {
+        "clock set back": _clock_set_back,
+        "another umask": _other_umask,
+        "read-only empty folder": _folder_of_another,
+    },
     "completed-scene": {"node without the folder": _node_without_folder},
     "report": {"SIGTERM of Snakemake": _stopped},
 }

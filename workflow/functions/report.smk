@@ -140,6 +140,21 @@ def record_failures():
             workflow.persistence._unmark_incomplete(str(output))
 
 
+def refuse_read_only_folders():
+    """End before the first job where one of this run could not write what it makes."""
+    folders = {
+        Path(file).parent for job in workflow.dag.needrun_jobs() for file in job.output
+    }
+    folders = {
+        next(filter(Path.exists, (folder, *folder.parents))) for folder in folders
+    }
+    frozen = sorted(str(folder) for folder in folders if not os.access(folder, os.W_OK))
+    if frozen:
+        raise WorkflowError(
+            f"{', '.join(frozen)} cannot be written to; check who may write there"
+        )
+
+
 def forecast_run():
     """What this run will take, in sentences; its jobs' seconds are left for the summary to compare."""
     with own_sigterm():

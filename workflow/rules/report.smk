@@ -272,6 +272,7 @@ rule write_pdf:
 
 onstart:
     hold_run_lock()
+    refuse_read_only_folders()
     for line in forecast_run():
         print(line, file=sys.stderr)
     mark_as_unfinished()
