@@ -71,12 +71,17 @@ def object_facts(row: Row) -> dict[str, str]:
     return _capital(facts | _next(has))
 
 
+def has_surface(folder: Path) -> bool:
+    """Whether an object's results hold a surface of its last fusion."""
+    surface, fused = folder / "surface.json", folder / "fused.ply"
+    return surface.is_file() and fused.is_file() and surface.stat().st_mtime >= fused.stat().st_mtime
+
+
 def surface_facts(folder: Path) -> dict[str, str]:
     """The same of the surface in an object's results; nothing where none was made of its last fusion."""
-    path, fused = folder / "surface.json", folder / "fused.ply"
-    if not path.is_file() or not fused.is_file() or path.stat().st_mtime < fused.stat().st_mtime:
+    if not has_surface(folder):
         return {}
-    found = read_json(path)
+    found = read_json(folder / "surface.json")
     if value(found, "status") == "empty":
         return {"Mesh": f"None: {value(found, 'reason')}"}
     shares = ", ".join(

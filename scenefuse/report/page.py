@@ -22,12 +22,17 @@ from PIL import Image
 from scenefuse.core.stage import StageError
 from scenefuse.report.values import asset
 from scenefuse.report.view import LEVELS, REMOVED, Shown, View, encode
+from scenefuse.report.view_mesh import ViewMesh, encode_mesh
+from scenefuse.surface.mesh import FaceClass
 
 # Of the scene, then of its objects in turn.
 SOURCE_COLORS = ("#c4c9ce", "#f07819", "#2f7fbf", "#3d9a5f", "#a45fb0", "#c9a227", "#4bb3b8", "#d1647f")
 REMOVED_COLOR, UNKNOWN_COLOR = "#b3261e", "#dfe2e5"
 # Colour and label of each number of the field `evidence`.
-EVIDENCE: dict[int, tuple[str, str]] = yaml.safe_load(asset("report.yaml"))["evidence"]
+EVIDENCE: dict[int, tuple[str, str]]
+# The same of the classes of faces.
+CLASSES: dict[int, tuple[str, str]]
+EVIDENCE, CLASSES = (yaml.safe_load(asset("report.yaml"))[name] for name in ("evidence", "classes"))
 Mode = dict[str, Any]
 
 
@@ -41,15 +46,19 @@ def document(title: str, body: list[str], has_views: bool) -> str:
 
 def embedded(path: Path, alt: str) -> str:
     """An <img> that holds the picture, as WebP: a third of the PNG's size; StageError where it is none."""
-    buffer = io.BytesIO()
     try:
         with Image.open(path) as opened:
-            size = opened.size
-            opened.convert("RGB").save(buffer, format="WEBP", quality=85, method=4)
+            size, data = opened.size, webp(opened)
     except OSError as error:
         raise StageError(f"{path} is not a readable picture ({error}); draw the figures again") from None
-    data = base64.b64encode(buffer.getvalue()).decode()
     return f'<img src="data:image/webp;base64,{data}" width="{size[0]}" height="{size[1]}" alt="{escape(alt)}">'
+
+
+def webp(image: Image.Image) -> str:
+    """A picture as WebP in base64."""
+    buffer = io.BytesIO()
+    image.convert("RGB").save(buffer, format="WEBP", quality=85, method=4)
+    return base64.b64encode(buffer.getvalue()).decode()
 
 
 def figure(path: Path, caption: str) -> str:
@@ -58,25 +67,39 @@ def figure(path: Path, caption: str) -> str:
     return f'<figure class="sheet">{picture}<figcaption>{escape(caption)}</figcaption></figure>'
 
 
-def view_section(key: str, name: str, view: View) -> str:
-    """One 3D view: stage, buttons, legend, and its points.
+def view_section(key: str, name: str, view: View, mesh: ViewMesh | None = None) -> str:
+    """One 3D view: stage, buttons, legend, its points and its mesh.
 
     Args:
         key: tells the views of a page apart.
         name: of what it shows, for labels.
         view: the points; few enough for a page.
+        mesh: of the completed object in the view's frame.
     """
     about, planes = encode(view)
-    about["modes"] = modes = _modes(view, about.get("deviation"))
+    deviations = about.get("deviation")
+    about["modes"] = modes = _modes(view, deviations)
+    buttons = {mode["name"]: mode["button"] for mode in modes}
+    whens, triangles, picture = {"before": "Before", "after": "After"}, b"", ""
+    if mesh is not None:
+        whens["surface"] = "Surface"
+        middle = (view.cloud.points.min(0) + view.cloud.points.max(0)) / 2
+        about["surface"], triangles = encode_mesh(mesh, middle, deviations)
+        own = _mesh_modes(mesh, [mode for mode in modes if mode["name"] == "deviation"])
+        about["surface"]["modes"] = own
+        buttons |= {mode["name"]: mode["button"] for mode in own}
+        picture = "" if mesh.picture is None else webp(mesh.picture)
     return Template(asset("view.html")).substitute(
         name=escape(name),
         # An object by itself has no before and after.
         one_cloud="" if (view.cloud.fields["shown"] != Shown.BOTH).any() else " hidden",
-        whens=_choice(f"when-{key}", {"before": "Before", "after": "After"}, "after"),
-        colours=_choice(f"colour-{key}", {mode["name"]: mode["button"] for mode in modes}, modes[0]["name"]),
+        whens=_choice(f"when-{key}", whens, "after"),
+        colours=_choice(f"colour-{key}", buttons, modes[0]["name"]),
         # A closing tag inside JSON would end the script element.
         about=json.dumps(about).replace("</", "<\\/"),
         points=base64.b64encode(planes).decode(),
+        triangles=base64.b64encode(triangles).decode(),
+        picture=picture,
     )
 
 
@@ -123,6 +146,22 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
         ends: Mode = {"ramp": ramp[::3], "low": low, "high": high}
         modes.append({"name": "deviation", "button": "Std. deviation", "other": other, "entries": entries} | ends)
     return modes
+
+
+def _mesh_modes(mesh: ViewMesh, deviation: list[Mode]) -> list[Mode]:
+    """The ways to colour a mesh: photos, or the points' colours; class; standard deviation as of the points."""
+    found = [
+        {"code": code, "color": color, "label": label, "when": ["surface"]}
+        for code, (color, label) in CLASSES.items()
+        if (mesh.vertices.fields["class"] == code).any()
+    ]
+    other, modes = {"color": UNKNOWN_COLOR}, list[Mode]()
+    if mesh.uv is not None or mesh.vertices.colors is not None:
+        bridged = [entry for entry in found if entry["code"] == FaceClass.BRIDGED]
+        label = "The photos on the mesh" if mesh.uv is not None else "The points' colours on the mesh"
+        modes.append({"name": "photo", "button": "Colours", "label": label, "entries": bridged, "other": other})
+    modes.append({"name": "evidence", "button": "Class", "entries": found, "other": other})
+    return modes + deviation
 
 
 def _entries(view: View, field: str, meanings: dict[int, tuple[str, str]]) -> list[Mode]:

@@ -247,24 +247,30 @@ def _planes(cells: NDArray[np.int64], cloud: Cloud) -> tuple[dict[str, Bytes], d
     planes: dict[str, Bytes] = {}
     about: dict[str, Any] = {}
     for name, column in zip("xyz", cells.T):
-        planes |= _difference_planes(name, column)
-    if cloud.colors is not None:
-        red, green, blue = cloud.colors.T
-        # Bytes wrap around; differences to green compress better than red and blue do.
-        planes |= {"green": green, "red_less_green": red - green, "blue_less_green": blue - green}
+        planes |= difference_planes(name, column)
+    planes |= color_planes(cloud)
     radii = _radii(cloud)
     about["radius"] = [float(radii[radii > 0].min()), float(radii.max())]
-    planes["radius_before"], planes["radius_after"] = _log_levels(radii, *about["radius"])
+    planes["radius_before"], planes["radius_after"] = log_levels(radii, *about["radius"])
     planes["shade"] = np.rint(LEVELS * _shade(cloud)).astype(np.uint8)
     planes |= {name: cloud.fields[name].astype(np.uint8) for name in ("source", "evidence") if name in cloud.fields}
     deviation = np.nan_to_num(cloud.fields.get("deviation", np.zeros(0)), posinf=0.0)
     if (deviation > 0).any():
         about["deviation"] = [float(end) for end in np.percentile(deviation[deviation > 0], [2, 98])]
-        planes["deviation"] = _log_levels(deviation, *about["deviation"])
+        planes["deviation"] = log_levels(deviation, *about["deviation"])
     return planes, about
 
 
-def _difference_planes(name: str, column: NDArray[np.int64]) -> dict[str, Bytes]:
+def color_planes(cloud: Cloud) -> dict[str, Bytes]:
+    """Planes of the colours; none without."""
+    if cloud.colors is None:
+        return {}
+    red, green, blue = cloud.colors.T
+    # Bytes wrap around; differences to green compress better than red and blue do.
+    return {"green": green, "red_less_green": red - green, "blue_less_green": blue - green}
+
+
+def difference_planes(name: str, column: NDArray[np.int64]) -> dict[str, Bytes]:
     """Differences of successive cells, modulo 2^16, small ones of either sign as small numbers; low and high bytes."""
     steps = (np.diff(column, prepend=0) + 32768) % 65536 - 32768
     folded = np.where(steps >= 0, 2 * steps, -2 * steps - 1)
@@ -281,7 +287,7 @@ def _radii(cloud: Cloud) -> NDArray[np.float32]:
     return radii
 
 
-def _log_levels(values: NDArray[np.floating], low: float, high: float) -> Bytes:
+def log_levels(values: NDArray[np.floating], low: float, high: float) -> Bytes:
     """Positive values as 1 to LEVELS, in equal ratios between two ends; anything else is 0."""
     ratio = np.log(max(high / low, 1.0 + 1e-9))
     share = np.clip(np.log(np.maximum(values, low) / low) / ratio, 0, 1)

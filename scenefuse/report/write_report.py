@@ -17,6 +17,7 @@ from scenefuse.report.run_summary import ALONE
 from scenefuse.report.tables import records
 from scenefuse.report.values import asset, number, read_table
 from scenefuse.report.view import View, read_view, thin
+from scenefuse.report.view_mesh import read_mesh
 
 # Of all 3D views together: about 8 MB. With more views than fit, each gets fewer points.
 PAGE_POINTS = 700_000
@@ -118,7 +119,8 @@ def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str
     facts = object_facts(row) | (surface_facts(folder) if is_finished else {})
     parts.append(f'<div class="pair">{"".join(pictures)}{_facts(facts)}</div>')
     if view is not None and is_finished:
-        parts.append(view_section(f"object-{folder.name}", folder.name, view))
+        mesh = read_mesh(folder, view.unit)
+        parts.append(view_section(f"object-{folder.name}", folder.name, view, mesh))
     elif status in texts["no_view"]:
         parts.append(f"<p>{texts['no_view'][status]}</p>")
     if is_finished and (figures / "missing.png").is_file():

@@ -95,11 +95,11 @@ def draw(surface: Surface, painted: Painted | None, axes: Array, pixel: float) -
     if surface.vertices.colors is not None:
         colors[on, :3] = (surface.vertices.colors[corner] * weights[..., None]).sum(1)
     if painted is not None:
-        found = cast(caster(painted.points @ axes.T, painted.faces), origins, down)
+        found = cast(caster(painted.points @ axes.T, painted.shown), origins, down)
         # Where a gap is bridged nothing is painted, and the ray goes on to another part.
         away = np.abs(found["t_hit"] - np.where(on, hit["t_hit"], -np.inf))
         of = np.flatnonzero(away <= MARGIN * surface.vertices.diagonal)
-        uv = painted.uv[painted.faces[found["primitive_ids"][of].astype(np.int64)]]
+        uv = painted.uv[painted.shown[found["primitive_ids"][of].astype(np.int64)]]
         at = (uv * _weights(found["primitive_uvs"][of])[..., None]).sum(1) * painted.picture.shape[1::-1] - 0.5
         for k in range(3):
             colors[of, k] = map_coordinates(painted.picture[..., k], at[:, ::-1].T, order=1, mode="nearest")
@@ -139,7 +139,8 @@ def draw_surface(*, name: str, surface: Path, glb: Path, georeference_json: Path
         folder: output, with drawings.json: pixel, scale, direction of each.
     """
     whole, painted = read_surface(surface), read_painted(glb)
-    unit, metres = length_unit(georeference_json), metres_per_unit(georeference_json)
+    unit = length_unit(georeference_json)
+    metres = metres_per_unit(unit)
     report: dict[str, Any] = {"status": quantity("drawn" if len(whole.faces) else "empty", "")}
     if painted is not None:
         painted = replace(painted, points=painted.points / metres)
@@ -186,7 +187,7 @@ def pixel_of(surface: Surface, painted: Painted | None) -> float:
     if painted is None:
         points = surface.vertices.points
         return float(np.median(cKDTree(points).query(points, k=2, workers=threads())[0][:, 1]))
-    corners, flat = painted.points[painted.faces], painted.uv[painted.faces] * painted.picture.shape[1::-1]
+    corners, flat = painted.points[painted.shown], painted.uv[painted.shown] * painted.picture.shape[1::-1]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     a, b = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
     return float(np.sqrt(area / np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()))

@@ -155,20 +155,27 @@ class Painted:
     """A mesh with its picture, as a GLB holds it, z up again.
 
     Attributes:
-        points: (V, 3) metres.
+        points: (V, 3) metres; each has faces of one class.
         faces: (F, 3).
-        uv: (V, 2) places in the picture, from its upper left, 0..1.
+        classes: (F,) values of FaceClass.
+        uv: (V, 2) places in the picture, from its upper left, 0..1; 0 of bridged faces.
         picture: (H, W, 3) uint8.
     """
 
     points: Array
     faces: NDArray[np.int64]
+    classes: NDArray[np.uint8]
     uv: Array
     picture: NDArray[np.uint8]
 
+    @property
+    def shown(self) -> NDArray[np.int64]:
+        """(P, 3) faces that photos paint."""
+        return self.faces[self.classes != FaceClass.BRIDGED]
+
 
 def read_painted(path: Path) -> Painted | None:
-    """The painted part of what `write_glb` wrote; None where nothing is."""
+    """What `write_glb` wrote with a picture; None where there is none."""
     data = path.read_bytes()
     length = int.from_bytes(data[12:16], "little")
     content, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
@@ -179,19 +186,20 @@ def read_painted(path: Path) -> Painted | None:
         entry = content["bufferViews"][number]
         return binary[entry["byteOffset"] : entry["byteOffset"] + entry["byteLength"]]
 
-    parts, count = list[tuple[Array, NDArray[np.int64], Array]](), 0
+    def rows(number: int, kind: str, width: int) -> NDArray[Any]:
+        return np.frombuffer(view(content["accessors"][number]["bufferView"]), kind).reshape(-1, width)
+
+    parts, count = list[tuple[NDArray[Any], ...]](), 0
     for primitive in content["meshes"][0]["primitives"]:
         names = primitive["attributes"]
-        if "TEXCOORD_0" in names:
-            numbers = (names["POSITION"], primitive["indices"], names["TEXCOORD_0"])
-            at, corners, flat = (view(content["accessors"][number]["bufferView"]) for number in numbers)
-            positions = np.frombuffer(at, "<f4").reshape(-1, 3) @ Y_UP_FROM_Z_UP
-            triangles = np.frombuffer(corners, "<u4").astype(np.int64).reshape(-1, 3) + count
-            parts.append((positions, triangles, np.frombuffer(flat, "<f4").reshape(-1, 2).astype(np.float64)))
-            count += len(positions)
+        points = rows(names["POSITION"], "<f4", 3) @ Y_UP_FROM_Z_UP
+        faces = rows(primitive["indices"], "<u4", 3).astype(np.int64) + count
+        classes = np.full(len(faces), FaceClass[primitive["extras"]["class"].upper()], np.uint8)
+        uv = rows(names["TEXCOORD_0"], "<f4", 2) if "TEXCOORD_0" in names else np.zeros((len(points), 2))
+        parts.append((points, faces, classes, uv))
+        count += len(points)
     picture = np.asarray(Image.open(io.BytesIO(view(content["images"][0]["bufferView"]))).convert("RGB"))
-    points, faces, uv = (np.concatenate(part) for part in zip(*parts))
-    return Painted(points, faces, uv, picture)
+    return Painted(*(np.concatenate(part) for part in zip(*parts)), picture)
 
 
 def _primitive(buffer: _Buffer, part: Surface, kind: FaceClass, metres: float, uv: Array | None) -> dict[str, Any]:
@@ -241,10 +249,10 @@ def _linear(colors: NDArray[Any]) -> Array:
     return np.where(colors <= 10, colors / 3294.6, ((colors / 255 + 0.055) / 1.055) ** 2.4)
 
 
-def metres_per_unit(georeference_json: Path | None) -> float:
-    """Metres in a unit of a scene; 1 where that is unknown."""
-    names = {unit.name: unit.conv_factor for unit in get_units_map("EPSG", "linear").values()}
-    return names.get(length_unit(georeference_json), 1.0)
+def metres_per_unit(unit: str) -> float:
+    """Metres in a unit of lengths by its name; 1 where that is unknown."""
+    names = {known.name: known.conv_factor for known in get_units_map("EPSG", "linear").values()}
+    return names.get(unit, 1.0)
 
 
 def place_of_scene(georeference_json: Path | None) -> dict[str, Any]:

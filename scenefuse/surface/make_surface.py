@@ -59,12 +59,12 @@ def make_surface(*, inputs: SurfaceInputs, surface: Path, glb: Path, report: Pat
         found, reason = _nothing(), str(error)
     write_surface(surface, found)
     painted, why = paint(found, views)
-    place, metres = place_of_scene(inputs.georeference_json), metres_per_unit(inputs.georeference_json)
+    unit, place = length_unit(inputs.georeference_json), place_of_scene(inputs.georeference_json)
     if painted is None:
-        write_glb(glb, found, place, metres)
+        write_glb(glb, found, place, metres_per_unit(unit))
     else:
-        write_glb(glb, painted.surface, place, metres, painted.uv, painted.picture)
-    content = surface_report(found, length_unit(inputs.georeference_json)) | {
+        write_glb(glb, painted.surface, place, metres_per_unit(unit), painted.uv, painted.picture)
+    content = surface_report(found, unit) | {
         "reason": quantity(reason, ""),
         "texture": quantity(why, ""),
         "textured": quantity(0.0 if painted is None else painted.shown_share, "of the area that is not bridged"),

@@ -14,6 +14,7 @@ from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.core.stage import StageError, atomic_directory, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.core.version import VERSION
+from scenefuse.photos.geodesy import length_unit
 from scenefuse.surface.gltf import earth_from_scene, metres_per_unit, place_of_scene, write_glb, write_points
 from scenefuse.surface.make_surface import read_surface
 from scenefuse.surface.mesh import Surface
@@ -41,7 +42,7 @@ def make_tiles(*, cloud: Path, objects: list[Path], georeference_json: Path | No
     Raises:
         StageError: the scene has no points.
     """
-    points, metres = read_cloud(cloud), metres_per_unit(georeference_json)
+    points, metres = read_cloud(cloud), metres_per_unit(length_unit(georeference_json))
     if not len(points):
         raise StageError(f"{cloud} holds no points; there is nothing to make tiles of")
     place, extras = earth_from_scene(georeference_json), place_of_scene(georeference_json)

@@ -8,8 +8,13 @@ import pytest
 from support.browser import chromium, click, touch
 
 from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.stage import quantity, write_json
+from scenefuse.core.transforms import UP, rotation_between
 from scenefuse.report.view import VIEW_POINTS, View, merge, write_view
 from scenefuse.report.write_report import write_report
+from scenefuse.surface.gltf import BRIDGED_TINT, write_glb
+from scenefuse.surface.make_surface import surface_report, write_surface
+from scenefuse.surface.mesh import Surface
 
 SECTION = "[aria-label='3D view of house']"
 STAGE = f"{SECTION} .view-stage"
@@ -171,6 +176,47 @@ def test_every_way_of_colouring_changes_the_picture_and_has_its_legend(opened):
             assert changed(pictures[first], pictures[second]) > 0.02, (first, second)
     choose(opened, "Before")
     assert "added" not in opened.find(f"{SECTION} .view-legend").text
+
+
+def test_the_surface_is_shown_with_photos_class_and_deviation_beside_the_points(browser, tmp_path):
+    """A plane that a picture paints, red on its far half and blue on its near one, with a bridged strip beside it."""
+    turned = rotation_between(np.array([0.0, 1, 0]), UP)
+    corners = np.array([[-1, -0.8], [0.6, -0.8], [0.6, 0.8], [-1, 0.8], [0.6, -0.8], [1, -0.8], [1, 0.8], [0.6, 0.8]])
+    points = np.column_stack([corners, np.full(8, 0.4)]) @ turned
+    fields = {"deviation": np.float32([0.001] * 4 + [np.nan] * 4), "class": np.uint8([1] * 4 + [2] * 4)}
+    vertices = Cloud(points, np.tile(np.float32(turned[2]), (8, 1)), np.zeros((8, 3), np.uint8), fields)
+    faces = np.array([[0, 1, 2], [2, 3, 0], [4, 5, 6], [6, 7, 4]])
+    surface = Surface(vertices, faces, np.uint8([1, 1, 2, 2]), 0.0)
+    uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]] * 2, np.float64)[faces]
+    picture = np.repeat(np.uint8([RED, BLUE]), 32, axis=0)[:, None].repeat(64, axis=1)
+    before, added = grid(), grid(9, 0.05, 0.4)
+    deviation = np.linspace(0.001, 0.05, len(before) + len(added)).astype(np.float32)
+    house = tmp_path / "house"
+    (house / "registration/full").mkdir(parents=True)
+    write_json(house / "registration/full/crop.json", {"up_in_scene": quantity([0, 1, 0], "")})
+    (house / "fused.ply").touch()
+    write_surface(house / "surface.ply", surface)
+    write_glb(house / "surface.glb", surface, {}, 1.0, uv, picture)
+    write_json(house / "surface.json", surface_report(surface, "m"))
+    browser.open(report(tmp_path, {"house": view_of(before, completed(before, added, deviation=deviation))}))
+    ready(browser)
+    choose(browser, "Source")
+    choose(browser, "Surface")
+    browser.value("await new Promise((next) => setTimeout(next, 400));")
+    # What a mesh does not have is not offered, and another colour is chosen.
+    assert "Source" not in browser.find(f"{SECTION} .colour").text
+    photos, legend = browser.picture(STAGE), f"{SECTION} .view-legend"
+    assert middle_of(photos, RED)[1] < middle_of(photos, BLUE)[1]
+    assert middle_of(photos, BRIDGED_TINT)[0] > middle_of(photos, RED)[0]
+    assert re.search("photos on the mesh.*bridged: interpolated.*4 triangles", browser.find(legend).text, re.DOTALL)
+    choose(browser, "Class")
+    classes = browser.picture(STAGE)
+    assert changed(photos, classes) > 0.1 and "measured: beside points" in browser.find(legend).text
+    assert classes[..., 1].mean() > photos[..., 1].mean()
+    choose(browser, "Std. deviation")
+    assert changed(browser.picture(STAGE), classes) > 0.1
+    choose(browser, "Before")
+    assert "441 points" in browser.find(legend).text and browser.complaints() == []
 
 
 def test_colours_whose_fields_are_absent_are_not_offered(opened):

@@ -248,7 +248,8 @@ def test_an_elevation_has_the_scale_that_it_says(closed, tmp_path: Path):
 def test_a_bridge_is_not_drawn_in_the_colours_of_what_lies_behind_it(closed):
     below = closed.part(closed.vertices.points[closed.faces][..., 2].max(1) < 0)
     red = np.full((8, 8, 3), (255, 0, 0), np.uint8)
-    painted = Painted(below.vertices.points, below.faces, np.full((len(below.vertices), 2), 0.5), red)
+    places = np.full((len(below.vertices), 2), 0.5)
+    painted = Painted(below.vertices.points, below.faces, below.classes, places, red)
     from_above = draw(closed, painted, np.eye(3), 0.02).colors
     from_below = draw(closed, painted, np.diag([1.0, -1, -1]), 0.02).colors
     shown = from_above[..., 3] > 0

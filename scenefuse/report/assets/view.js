@@ -1,7 +1,6 @@
+const unpack = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 const inflate = async (text) => {
-  const packed = atob(text), bytes = new Uint8Array(packed.length);
-  for (let i = 0; i < bytes.length; i++) bytes[i] = packed.charCodeAt(i);
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const stream = new Blob([unpack(text)]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
 };
 
@@ -16,27 +15,53 @@ const library = () => k3d ??= inflate(document.getElementById("k3d").textContent
 // Every view holds a WebGL context, and browsers drop the oldest of too many.
 const MOST_LIVE = 4, live = [];
 const FIELD_OF_VIEW = 35;
+const UNMOVED = { data: new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), shape: [4, 4] };
 
-const decode = (about, bytes) => {
-  const counts = about.points, count = counts.before + counts.both + counts.after;
-  const planes = {};
-  about.planes.forEach((name, k) => { planes[name] = bytes.subarray(k * count, (k + 1) * count); });
-  const positions = new Float32Array(3 * count);
-  ["x", "y", "z"].forEach((axis, a) => {
-    const low = planes[axis + "_low"], high = planes[axis + "_high"];
+const planesOf = (names, bytes, count) =>
+  Object.fromEntries(names.map((name, k) => [name, bytes.subarray(k * count, (k + 1) * count)]));
+
+// The rows of columns that are held as differences.
+const rows = (names, planes, count, of) => {
+  const values = new Float32Array(names.length * count);
+  names.forEach((name, a) => {
+    const low = planes[name + "_low"], high = planes[name + "_high"];
     for (let i = 0, cell = 0; i < count; i++) {
       const folded = low[i] | (high[i] << 8);
       cell = (cell + (folded & 1 ? -(folded + 1) >> 1 : folded >> 1)) & 65535;
-      positions[3 * i + a] = about.corner[a] + cell * about.step[a];
+      values[names.length * i + a] = of(cell, a);
     }
   });
+  return values;
+};
+const placesOf = (about, planes, count) =>
+  rows(["x", "y", "z"], planes, count, (cell, a) => about.corner[a] + cell * about.step[a]);
+
+const decode = (about, bytes) => {
+  const counts = about.points, count = counts.before + counts.both + counts.after;
+  const planes = planesOf(about.planes, bytes, count), positions = placesOf(about, planes, count);
   const [least, largest] = about.radius, diameters = {};
   for (const when of ["before", "after"]) {
     const levels = planes["radius_" + when];
     diameters[when] = Float32Array.from(levels, (v) => 2 * least * (largest / least) ** ((v - 1) / (about.levels - 1)));
   }
   const runs = { before: [0, counts.before + counts.both], after: [counts.before, count] };
+  // On the surface the points after are picked, on which it lies.
+  runs.surface = runs.after;
+  diameters.surface = diameters.after;
   return { count, planes, positions, diameters, runs };
+};
+
+const decodeMesh = (about, bytes, picture) => {
+  const { vertices: count, faces } = about, planes = planesOf(about.planes, bytes, count);
+  const uvs = picture.length ? rows(["u", "v"], planes, count, (cell) => cell / 65535) : null;
+  const corner = planesOf([...Array(9).keys()], bytes.subarray(about.planes.length * count), faces);
+  const indices = new Uint32Array(3 * faces);
+  for (let f = 0, first = 0; f < faces; f++) {
+    const beyond = (k) => corner[k][f] | (corner[k + 1][f] << 8) | (corner[k + 2][f] << 16);
+    first += beyond(0);
+    indices.set([first, first + beyond(3), first + beyond(6)], 3 * f);
+  }
+  return { count, planes, positions: placesOf(about, planes, count), uvs, indices, picture };
 };
 
 const hex = (color) => parseInt(color.slice(1), 16);
@@ -52,14 +77,17 @@ const paint = (mode, about, { count, planes }) => {
       const g = green[i];
       colors[i] = (((red[i] + g) & 255) << 16) | (g << 8) | ((blue[i] + g) & 255);
     }
+    for (const { code, color } of mode.entries ?? [])
+      planes.evidence.forEach((c, i) => { if (c === code) colors[i] = hex(color); });
     return colors;
   }
   const table = new Uint32Array(256).fill(hex(mode.other.color)), plane = planes[mode.name];
   mode.entries.forEach((entry) => { table[entry.code] = hex(entry.color); });
   // Along a ramp brightness means something: shade it less.
   const least = mode.ramp ? 0.5 : 0;
-  for (let i = 0; i < count; i++)
-    colors[i] = dimmed(table[plane[i]], least + (1 - least) * planes.shade[i] / about.levels);
+  // A mesh gets its light as it turns.
+  const shade = (i) => planes.shade ? least + (1 - least) * planes.shade[i] / about.levels : 1;
+  for (let i = 0; i < count; i++) colors[i] = dimmed(table[plane[i]], shade(i));
   return colors;
 };
 
@@ -107,8 +135,9 @@ class View {
   get shown() { return this.section.querySelector(".when input:checked").value; }
   get mode() {
     const name = this.section.querySelector(".colour input:checked").value;
-    return this.about.modes.find((mode) => mode.name === name);
+    return this.modes.find((mode) => mode.name === name);
   }
+  get modes() { return (this.shown === "surface" ? this.about.surface : this.about).modes; }
   get measuring() { return this.button.getAttribute("aria-pressed") === "true"; }
 
   async start() {
@@ -159,24 +188,55 @@ class View {
 
   home() { return firstCamera(this.about, this.data.positions, this.stage.clientWidth / this.stage.clientHeight); }
 
-  // The points of the chosen picture in the chosen colours.
+  // What is chosen in the chosen colours.
   async show() {
+    this.offer();
+    this.describe();
+    if (!this.plot) return;
+    const objects = this.shown === "surface" ? await this.triangles() : [this.points()];
+    for (const id of [1, 2]) if (this.plot.getWorld().ObjectsById[id]) this.plot.removeObject(id);
+    await this.plot.load({ objects });
+    this.plot.render();
+  }
+
+  // Only the colours that what is shown has.
+  offer() {
+    const inputs = [...this.section.querySelectorAll(".colour input")];
+    const has = (input) => this.modes.some((mode) => mode.name === input.value);
+    inputs.forEach((input) => { input.parentElement.hidden = !has(input); });
+    if (!this.mode) inputs.find(has).checked = true;
+  }
+
+  // The mesh as K3D takes it: under photos, which hold their own light, what is bridged is an object of one colour.
+  async triangles() {
+    const { section, about, mode } = this, text = (name) => section.querySelector(name).textContent;
+    this.mesh ??= decodeMesh(about.surface, await inflate(text(".triangles")), unpack(text(".picture")));
+    const { count, positions, indices, uvs, planes, picture } = this.mesh;
+    const array = (values, width) => ({ data: values, shape: width > 1 ? [values.length / width, width] : [values.length] });
+    const part = (id, corners, looks) => ({
+      id, type: "Mesh", visible: true, opacity: 1, side: "double", color: 0xffffff, model_matrix: UNMOVED,
+      vertices: array(positions, 3), indices: array(corners, 3), ...looks,
+    });
+    if (mode.name !== "photo" || !uvs) return [part(1, indices, { colors: array(paint(mode, about, this.mesh), 1) })];
+    const tint = mode.entries[0], of = (bridged) => indices.filter((_, k) =>
+      (planes.evidence[indices[k - k % 3]] === tint?.code) === bridged);
+    const looks = { color: 0, emissive: 0xffffff, uvs: array(uvs, 2), emissive_map: array(picture, 1) };
+    const photos = part(1, of(false), looks);
+    return tint ? [photos, part(2, of(true), { color: 0, emissive: hex(tint.color) })] : [photos];
+  }
+
+  points() {
     const { data, shown, mode } = this, [from, to] = data.runs[shown];
     this.colors = this.painted === mode.name ? this.colors : paint(mode, this.about, data);
     this.painted = mode.name;
-    this.describe();
-    if (!this.plot) return;
     const array = (values, width) => ({ data: values, shape: width > 1 ? [to - from, width] : [to - from] });
-    const points = {
+    return {
       id: 1, type: "Points", shader: "flat", visible: true, opacity: 1, point_size: 1,
       positions: array(data.positions.subarray(3 * from, 3 * to), 3),
       colors: array(this.colors.subarray(from, to), 1),
       point_sizes: array(data.diameters[shown].subarray(from, to), 1),
-      model_matrix: { data: new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), shape: [4, 4] },
+      model_matrix: UNMOVED,
     };
-    if (this.plot.getWorld().ObjectsById[1]) this.plot.removeObject(1);
-    await this.plot.load({ objects: [points] });
-    this.plot.render();
   }
 
   describe() {
@@ -195,15 +255,16 @@ class View {
       item.append(mode.low, ramp, mode.high);
       legend.append(item);
       entry(mode.other.color, mode.other.label);
-    } else if (mode.entries) {
-      mode.entries.filter((e) => e.when.includes(shown)).forEach((e) => entry(e.color, e.label));
     } else {
-      legend.append(mode.label);
+      if (mode.label) legend.append(mode.label);
+      mode.entries?.filter((e) => e.when.includes(shown)).forEach((e) => entry(e.color, e.label));
     }
-    const count = document.createElement("span"), [from, to] = this.data.runs[shown], all = about.total[shown];
+    if (shown === "surface") legend.append("Holes are left open: nothing was measured there");
+    const count = document.createElement("span"), [from, to] = this.data.runs[shown];
+    const [held, all, what] = shown === "surface" ? [about.surface.faces, about.surface.all_faces, "triangles"]
+      : [to - from, about.total[shown], "points"];
     count.className = "count";
-    const some = to - from < all ? `${(to - from).toLocaleString("en")} of ` : "";
-    count.textContent = `${some}${all.toLocaleString("en")} points`;
+    count.textContent = `${held < all ? `${held.toLocaleString("en")} of ` : ""}${all.toLocaleString("en")} ${what}`;
     legend.append(count);
   }
 
