@@ -25,12 +25,15 @@ JOB_S = 4.0
 # A megapixel that is searched for features, enlarged ones too; two photos, times the features of both; a photo in the
 # mapping, times its features.
 FEATURES_S, PAIR_S, MAPPING_S = 0.3, 6e-9, 7e-4
-# A megapixel of a scene's depth maps: stereo, fusion, and how uncertain they are.
-STEREO_S, FUSION_S, SPREAD_S = 6.5, 1.2, 2.2
+# A megapixel of a scene's depth maps, and one of any maps in each job that reads them.
+STEREO_S, MAPS_S = 6.5, 1.5
+MAP_READERS = {
+    "scene": ("fuse_depth_maps", "estimate_scene_spread"),
+    "object": ("refine_depth", "make_object_cloud", "fuse_object", "find_missing"),
+}
 MASK_S = {"sam2": 13.0, "grabcut": 0.9}
-# A photo in an epoch of the depth network; a ray; a megapixel of an object's rendered maps in each job that reads them.
-DEPTH_NETWORK_S, RAY_S, MAPS_S = 0.09, 5.5e-5, 1.5
-MAP_READERS = ("refine_depth", "make_object_cloud", "fuse_object", "find_missing")
+# A photo in an epoch of the depth network; a ray.
+DEPTH_NETWORK_S, RAY_S = 0.09, 5.5e-5
 # The clock's time, over processor seconds shared by all cores: jobs that wait for each other leave some idle.
 IDLE_FACTOR = 1.15
 # A forecast is right within this factor: what is short by more cannot do.
@@ -128,11 +131,7 @@ def job_seconds(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) 
     }
     if kind == "scene":
         maps = photos.megapixels(own["depth_maps"]["max_image_size_px"])
-        work = {
-            "estimate_depth_maps": STEREO_S * maps / own["chunks"],
-            "fuse_depth_maps": FUSION_S * maps,
-            "estimate_scene_spread": SPREAD_S * maps,
-        }
+        work = {"estimate_depth_maps": STEREO_S * maps / own["chunks"]}
     else:
         maps = photos.megapixels(own["nerf"]["width_px"] * max(photos.width, photos.height) / photos.width)
         rays = own["nerf"]["rays_per_epoch"]
@@ -141,8 +140,8 @@ def job_seconds(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) 
             "train_depth": DEPTH_NETWORK_S * own["stage1"]["epochs"] * photos.count,
             "train_object_nerf": RAY_S * own["stage2"]["epochs"] * rays,
             "retrain_object_nerf": RAY_S * own["stage4"]["epochs"] * rays,
-            **dict.fromkeys(MAP_READERS, MAPS_S * maps),
         }
+    work |= dict.fromkeys(MAP_READERS[kind], MAPS_S * maps)
     return {rule: JOB_S + seconds for rule, seconds in (model if row.get("cloud") else model | work).items()}
 
 

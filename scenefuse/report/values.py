@@ -50,6 +50,11 @@ def read_table(path: Path) -> pd.DataFrame:
         return pd.DataFrame()
 
 
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows of a table, column -> cell."""
+    return [{str(k): v for k, v in row.items()} for row in table.to_dict("records")]
+
+
 def find(fields: Fields, *names: str) -> Any:
     """The value of the first of `names` that is there: by full name, else by the last part of a name; else None."""
     found = _field(fields, names)

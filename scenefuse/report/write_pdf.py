@@ -14,10 +14,9 @@ from PIL import Image
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.version import VERSION
 from scenefuse.report.facts import object_facts, scene_facts, surface_facts
-from scenefuse.report.tables import records
-from scenefuse.report.values import length, read_table
+from scenefuse.report.values import length, read_table, records
 
-MARGIN_MM, GAP_MM = 15, 4
+GAP_MM = 4
 SIDES = ("south", "east", "north", "west")
 
 
@@ -71,13 +70,12 @@ class _Page(FPDF):
         self.add_font("sans", "", fonts / "DejaVuSans.ttf")
         self.add_font("sans", "B", fonts / "DejaVuSans-Bold.ttf")
         self.project = project
-        self.set_margin(MARGIN_MM)
         self.set_title(project)
         self.set_creator(f"scenefuse {VERSION}")
 
     def footer(self) -> None:
         """The project, the version and the number of the page."""
-        self.set_y(-MARGIN_MM)
+        self.set_y(-self.l_margin)
         self.set_font("sans", size=7)
         self.cell(0, 4, f"{self.project}, made by scenefuse {VERSION}", align="L")
         self.cell(0, 4, f"{self.page_no()}", align="R")

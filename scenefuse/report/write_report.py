@@ -14,8 +14,7 @@ from scenefuse.core.version import VERSION
 from scenefuse.report.facts import WORDS, object_facts, scene_facts, surface_facts
 from scenefuse.report.page import document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
-from scenefuse.report.tables import records
-from scenefuse.report.values import asset, number, read_table
+from scenefuse.report.values import asset, number, read_table, records
 from scenefuse.report.view import View, read_view, thin
 from scenefuse.report.view_mesh import read_mesh
 

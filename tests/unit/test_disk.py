@@ -2,8 +2,8 @@
 
 import os
 
-from scenefuse.report.tables import disk_table
 from scenefuse.report.values import parts_of
+from scenefuse.report.write_summary import disk_table
 
 
 def test_parts_are_counted_once_and_links_are_not(tmp_path):

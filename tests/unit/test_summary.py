@@ -15,10 +15,9 @@ from scenefuse.core.job_records import KILLED, NO_LOG, NOT_ACCEPTED, JobRecords,
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.report.facts import closing_lines
 from scenefuse.report.run_summary import RunInputs
-from scenefuse.report.tables import runtime_table
 from scenefuse.report.values import find, flatten, length, load, number, percent
 from scenefuse.report.write_report import write_report
-from scenefuse.report.write_summary import write_summary
+from scenefuse.report.write_summary import runtime_table, write_summary
 
 HEADER = "s\th:m:s\tmax_rss\tmax_vms\tmax_uss\tmax_pss\tio_in\tio_out\tmean_load\tcpu_time\n"
 
