@@ -116,7 +116,7 @@ SECTIONS: dict[str, list[Any]] = {
     "scene": [ChunkSettings()],
     "scene.features": [FeatureSettings()],
     "scene.matches": [MatchSettings()],
-    "scene.sparse": [MappingSettings(min_registered_share=0.8)],
+    "scene.sparse": [MappingSettings()],
     "scene.georegister": [GeoreferenceSettings()],
     "scene.undistort": [UndistortSettings()],
     "scene.depth_maps": [DepthMapSettings()],

@@ -60,7 +60,8 @@ ATTEMPTS = 3
 class MappingSettings:
     """Incremental mapping and bundle adjustment."""
 
-    min_registered_share: float = setting(0.7, least=0, most=1)
+    # Half: then no other model can hold more of them.
+    min_registered_share: float = setting(0.5, least=0, most=1)
     """Smallest share of the photos that have to be registered, 0 to 1; fewer is an error."""
 
 
