@@ -43,8 +43,6 @@ RANK_WEIGHT = 0.02
 MIN_APART = 0.02
 # Their depths differ by this, in nerf units: twice what the loss of absolute depth takes for noise.
 RANK_MARGIN = 2 * DEPTH_DELTA
-# Rows of the fine levels that show nothing but edges take steps 1 + this times as long (method N9).
-EDGE_RATE = 1.0
 
 
 class OrderAndEdges:
@@ -58,22 +56,14 @@ class OrderAndEdges:
         photos: that it is trained on, with their prior.
         images: photos of a batch.
         rank_weight: weight of the order's loss.
-        edge_rate: see EDGE_RATE.
     """
 
-    def __init__(
-        self,
-        nerf: Nerf,
-        photos: PhotoTensors,
-        images: int,
-        rank_weight: float = RANK_WEIGHT,
-        edge_rate: float = EDGE_RATE,
-    ) -> None:
+    def __init__(self, nerf: Nerf, photos: PhotoTensors, images: int, rank_weight: float = RANK_WEIGHT) -> None:
         device = nerf.field.table.device
         self.weights: Mapping[str, float] = {"rank": rank_weight}
         # (T, 2) opacity that each row of the table has shown at edges, and in all.
         self.state = torch.zeros(len(nerf.field.table), 2, device=device)
-        self.images, self.apart_px, self.rate = images, MIN_APART * photos.images.shape[2], edge_rate
+        self.images, self.apart_px = images, MIN_APART * photos.images.shape[2]
         border = dilate(photos.masks, 1) & ~dilate(photos.masks, -1)
         # Rays are drawn beyond the band: the zone around mask edges and depth jumps that counts as an edge is wider.
         self.edges = dilate(border | depth_jumps(photos.depths), NERF.mask_band_px + 1).float().to(device)
@@ -97,8 +87,9 @@ class OrderAndEdges:
             table.copy_(before + self.factor(nerf.field) * (table - before))
 
     def factor(self, field: Field) -> Tensor:
-        """(T, 1) how much longer the step of each row is: 1 on the coarse half of the levels."""
-        factor = 1 + self.rate * self.state[:, :1] / self.state[:, 1:].clamp(min=1e-12)
+        """(T, 1) how much longer the step of each row is (method N9): 1 on the coarse half of the levels, 2 where a row
+        shows nothing but edges."""
+        factor = 1 + self.state[:, :1] / self.state[:, 1:].clamp(min=1e-12)
         factor[: int(field.grid.offset[field.settings.levels // 2])] = 1.0
         return factor
 
