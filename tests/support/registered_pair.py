@@ -2,18 +2,31 @@
 
 import numpy as np
 
+from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.register import register
+from scenefuse.register.decision import Decision
+from scenefuse.register.refinement import Outcome
 from scenefuse.register.register import Registration
+from scenefuse.register.score import Hypothesis, Score
 
 
-def registered_at_once(monkeypatch, pose: Sim3, registered: bool = True) -> None:
-    """`scenefuse register` finds this pose of the object without looking for it, and no other place."""
+def registered_at_once(monkeypatch, pose: Sim3, registered: bool = True) -> list[tuple[Cloud, Cloud]]:
+    """`scenefuse register` finds this pose of the object without looking for it, and no other place.
 
-    def found(*known: object) -> Registration:
+    Returns:
+        Object and scene as the search gets them, each time that it is called.
+    """
+    searched = list[tuple[Cloud, Cloud]]()
+
+    def found(obj: Cloud, scene: Cloud, *known: object) -> Registration:
+        searched.append((obj, scene))
         origins, unit = (np.zeros(3), np.zeros(3)), str(known[-1])
-        return Registration(registered, "planted", pose, None, origins, ScaleRange(pose.scale, 0.0), {}, unit)
+        best = Hypothesis(pose, "planted", Score(1.0, 1.0, 1.0, None, None, 0.0))
+        outcome = Outcome([best], Decision(registered, "planted", "geometry", 1.0, None, None), None)
+        return Registration(registered, "planted", pose, outcome, origins, ScaleRange(pose.scale, 0.0), {}, unit)
 
     monkeypatch.setattr(register, "register_once", found)
     monkeypatch.setattr(register, "likely_places", lambda *known: [])
+    return searched

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -28,6 +29,7 @@ FLIGHT = capture.FlightSettings(
     gps_noise_vertical=0.0,
 )
 ORBIT = capture.OrbitSettings(views=4, width_px=64, supersampling=1)
+MESH = World.mesh
 # Far more than a camera's, so that a photo of few pixels shows it.
 DISTORTED = Body(shift=(0.06, -0.05), distortion=(-0.15, 0.04, 0.01, -0.008))
 
@@ -39,8 +41,10 @@ def world() -> World:
 
 @pytest.fixture(autouse=True, scope="module")
 def one_world(world: World) -> Iterator[None]:
-    """Every stage gets the world that is already there, with an open sky."""
+    """Every stage gets the world that is already there, with an open sky, and each of its meshes once."""
+    meshes = cache(lambda owner: MESH(world, owner))
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(World, "mesh", lambda _, owner: meshes(owner))
         patch.setattr(capture, "build_world", lambda seed: world)
         patch.setattr(clicks, "build_world", lambda seed: world)
         patch.setattr(capture, "openness", lambda w, *_: np.ones(len(w.vertices), dtype=np.float32))
@@ -62,8 +66,10 @@ def render_all(root: Path) -> None:
     capture.render_object(name="house", **house, settings=ORBIT, camera="real", seed=0)
 
 
-def test_same_seed_same_bytes_and_all_files(tmp_path: Path, rendered: Path) -> None:
+def test_same_seed_same_bytes_and_all_files(tmp_path: Path, rendered: Path, world: World) -> None:
     render_all(tmp_path)
+    again, once = MESH(world, world.owner("house")), world.mesh(world.owner("house"))
+    assert all(map(np.array_equal, again, once))
     files = manifest(rendered)
     assert files == manifest(tmp_path)
     assert sum(name.startswith("scene/") for name in files) == 6

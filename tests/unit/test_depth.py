@@ -194,7 +194,7 @@ def test_training_mends_a_wrong_first_depth(tmp_path):
         return np.median(np.abs(depth[views.masks] / truth[views.masks] - 1.0))
 
     before = depth_off()
-    train_network(network, photos, wrong, Recipe(epochs=40, warmup_epochs=1, batch_photos=6), tmp_path / "state.pt", 0)
+    train_network(network, photos, wrong, Recipe(epochs=25, warmup_epochs=1, batch_photos=6), tmp_path / "state.pt", 0)
     assert depth_off() < 0.5 * before
 
 

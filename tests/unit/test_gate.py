@@ -277,7 +277,7 @@ FINE = replace(SETTINGS, voxel_fraction=0.02, turn_steps=8)
 
 @pytest.fixture(scope="module")
 def house():
-    return plant("house", 5, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
+    return plant("house", 5, ground=False, noise=0.005, object_points=3000, density_ratio=1.0)
 
 
 def registered(obj, scene, up=None, starts=None, alignment=None, up_in_scene=Z):
@@ -344,7 +344,7 @@ def test_from_half_a_turn_off_the_true_pose_is_found(house):
 
 
 def test_an_object_that_the_scene_does_not_have_is_refused(house):
-    other = plant("sculpture", 7, ground=False, noise=0.005, density_ratio=1.0).scene
+    other = plant("sculpture", 7, ground=False, noise=0.005, object_points=3000, density_ratio=1.0).scene
     decision = registered(house.object, other, house.up_in_object).decision
     assert not decision.registered and ("F-score" in decision.reason or "explains" in decision.reason)
 

@@ -40,7 +40,7 @@ SETTINGS = NerfSettings(
     width_px=48,
     hull_tolerance=0.0,
     field=FIELD,
-    schedule=Schedule(epochs=2, rays_per_epoch=200 * 256),
+    schedule=Schedule(epochs=2, rays_per_epoch=120 * 256),
     recipe=RECIPE,
     losses=WEIGHTS,
     maps=RenderedMapSettings(render_samples=24, map_agreement=0.03),

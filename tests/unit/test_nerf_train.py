@@ -258,7 +258,7 @@ def test_from_directions_that_no_photo_has_colours_are_those_that_photos_agree_o
 
 def _error_from_anywhere(sphere, share):
     """RMS error of the trained field's colours on the surface that a photo shows, asked for from random directions."""
-    nerf, photos, cube, _ = _train(sphere, steps=400, turned_share=share)
+    nerf, photos, cube, _ = _train(sphere, steps=200, turned_share=share)
     images, _, intrinsics, poses, depths = sphere
     points, rows, columns = surface_points(depths[0], intrinsics[0], poses[0])
     directions = torch.nn.functional.normalize(torch.randn(len(points), 3, generator=torch.manual_seed(1)), dim=1)

@@ -119,7 +119,7 @@ def test_where_nothing_moves_with_the_camera_nothing_is_learned():
     assert float(masked) == pytest.approx(float(alone["photometric"]), rel=0.15)
 
 
-def _trained(frames, path, epochs=50, **target):
+def _trained(frames, path, epochs=30, **target):
     """Networks trained on frames, and their losses."""
     torch.manual_seed(0)
     networks, length = new_monocular_networks(CPU), Recipe(epochs, 2)
@@ -305,7 +305,7 @@ def test_stages_run_from_sfm_poses_and_stage_3_goes_on_from_the_networks_of_stag
     train_nerf_as_paper(
         workspace=tmp_path / "poses", prior=tmp_path / "stage1", stage=tmp_path / "stage2",
         report=tmp_path / "stage2.json", checkpoints=tmp_path / "checkpoints",
-        settings=NerfSettings(device="cpu", width_px=48, field=field, schedule=Schedule(10, 6000)), **given,
+        settings=NerfSettings(device="cpu", width_px=48, field=field, schedule=Schedule(4, 6000)), **given,
     )  # fmt: skip
     refine_as_paper(
         poses=tmp_path / "poses", earlier=EarlierStages(tmp_path / "stage1", tmp_path / "stage2"),

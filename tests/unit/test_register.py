@@ -76,7 +76,7 @@ def test_a_note_says_that_the_object_s_own_crs_is_not_used(tmp_path, house, caps
 
 def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path, monkeypatch):
     monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
-    trial = plant("house", 5, noise=0.005, object_points=6000, density_ratio=1.0)
+    trial = plant("house", 5, noise=0.005, object_points=3000, density_ratio=1.0)
     write_cloud(tmp_path / "scene.ply", Cloud(trial.scene.points + UTM, None, trial.scene.colors))
     rows = np.hstack([trial.object.points, trial.object.colors])
     np.savetxt(tmp_path / "house.xyz", rows, header="X Y Z R G B", comments="//", fmt=["%.9g"] * 3 + ["%d"] * 3)
@@ -118,12 +118,13 @@ def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_pa
     assert sorted(p.name for p in out.iterdir()) == ["picture.png", "transform.json"]
 
 
-def test_origins_far_away_change_nothing(house):
+def test_two_runs_agree_bit_for_bit_and_origins_far_away_change_nothing(house):
     # Coordinates of few binary digits, so that moving them rounds nothing.
     near = Cloud(np.round(house.scene.points * 2**16) / 2**16, house.scene.normals, house.scene.colors)
     far = Cloud(near.points + UTM, near.normals, near.colors)
     here, there = (register_clouds(house.object, scene, LITTLE, 0) for scene in (near, far))
-    assert np.array_equal(here.outcome.ranked[0].pose.matrix, there.outcome.ranked[0].pose.matrix)
+    poses = [[h.pose.matrix.tobytes() for h in found.outcome.ranked] for found in (here, there)]
+    assert poses[0] == poses[1]
     shift = there.scene_from_object.translation - here.scene_from_object.translation
     assert np.abs(shift - UTM).max() < 1e-8
 

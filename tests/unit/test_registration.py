@@ -46,16 +46,7 @@ LITTLE = (
 
 @pytest.fixture(scope="module")
 def house():
-    return plant("house", 5, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
-
-
-def register(trial, scene=None, settings=(COARSE, FINE), seed=0):
-    scene = trial.scene if scene is None else scene
-    ups = (trial.up_in_object, Z)
-    scales = prior(estimates(trial.object, scene, ups), ScaleSettings())
-    problem = Problem(trial.object, scene, scales, Constraints(ups, trial.free_space), seed)
-    found = find_hypotheses(problem, settings[0])
-    return refine_hypotheses(problem, [(h.pose, h.source) for h in found], settings[1])
+    return plant("house", 5, ground=False, noise=0.005, object_points=3000, density_ratio=1.0)
 
 
 def refined(trial, start, *, evidence=None, settings=LITTLE[1]):
@@ -71,26 +62,18 @@ def by_clouds(house):
     return refined(house, house.scene_from_object)
 
 
-@pytest.fixture(scope="module")
-def searched(house):
-    """The house by the whole registration, with little work."""
-    return register(house, settings=LITTLE)
-
-
-@pytest.mark.parametrize("name", ["house", "balloon"])
-def test_a_planted_pose_is_found_and_accepted(name):
-    trial = plant(name, 5, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
-    outcome = register(trial)
+def test_a_planted_pose_is_found_and_accepted():
+    trial = plant("balloon", 5, ground=False, noise=0.005, object_points=4000, density_ratio=1.0)
+    ups = (trial.up_in_object, Z)
+    scales = prior(estimates(trial.object, trial.scene, ups), ScaleSettings())
+    problem = Problem(trial.object, trial.scene, scales, Constraints(ups, trial.free_space))
+    starts = [(h.pose, h.source) for h in find_hypotheses(problem, COARSE)]
+    outcome = refine_hypotheses(problem, starts, FINE)
     scale, angle, shift = errors(
         outcome.ranked[0].pose, trial.scene_from_object, trial.object.points.mean(0), trial.diagonal
     )
     assert outcome.decision.registered, outcome.decision.reason
     assert abs(scale) < 2 and angle < 2 and shift < 0.01
-
-
-def test_two_runs_agree_bit_for_bit(house, searched):
-    again = register(house, settings=LITTLE)
-    assert [h.pose.matrix.tobytes() for h in searched.ranked] == [h.pose.matrix.tobytes() for h in again.ranked]
 
 
 def test_rms_scale_of_a_scaled_copy_has_the_right_direction():
@@ -336,7 +319,7 @@ def test_of_photos_and_clouds_that_agree_the_less_uncertain_gives_the_pose(house
 
 def test_clouds_that_fit_as_well_at_the_pose_of_the_photos_are_as_uncertain_as_they_differ(house, by_clouds):
     truth, alone = house.scene_from_object, by_clouds
-    apart = 6 * alone.uncertainty.translation_sd
+    apart = 4 * alone.uncertainty.translation_sd
     beside = Sim3(1.0, np.eye(3), np.array([apart, 0, 0])) @ truth
     # Half as certain as the clouds say, and yet less uncertain than what both differ by.
     sure = Uncertainty.even(*2 * alone.uncertainty.deviations)
@@ -441,8 +424,8 @@ def test_free_space_is_read_from_the_depth_maps_of_a_workspace(tmp_path, house):
     assert read_free_space(tmp_path, (tmp_path / "none",), house.scene.points, 5, 1.0) is None
 
 
-def test_scale_ledger_names_every_estimate_and_the_winner(house, searched):
-    outcome = searched
+def test_scale_ledger_names_every_estimate_and_the_winner(house, by_clouds):
+    outcome = by_clouds
     content = {"ledger": quantity([{"name": "rms", "scale": 1.0, "used": False}], "")}
     alignment = shared(house.scene_from_object)
     rows = scale_ledger(content, alignment, outcome.ranked[0], outcome.uncertainty, outcome.decision.decided_by)

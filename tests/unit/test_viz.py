@@ -156,6 +156,13 @@ def box_surface(count, seed):
     return Cloud((points * [1.0, 0.5, 0.5]) + [0, 0, 0.5], None, colors)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def small_pictures():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scenefuse.report.figures.TILE_PX", (160, 120))
+        yield
+
+
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     """Everything the figures read, for a box whose lower half the scene misses."""
