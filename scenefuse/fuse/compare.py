@@ -16,6 +16,7 @@ from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.measure import MIN_NEIGHBOURS, RESOLUTION, Measured
 from scenefuse.geometry.depth_test import CELL_SPACINGS, see
+from scenefuse.geometry.photo_kernel import MIN_AGREEING
 from scenefuse.photos.workspace import View
 
 Mask = NDArray[np.bool_]
@@ -35,9 +36,9 @@ REASONS = {
 }
 # How far a point must lie before or behind a surface to be seen through or hidden, as a share of the diagonal.
 MARGIN = RESOLUTION
-# Photos that must see through a point, and the share of those that it is open to: a surface that is wrong itself lies
-# behind good points in some photos; a point that is not there has surfaces behind it in many.
-THROUGH_PHOTOS, THROUGH_SHARE = 2, 0.2
+# Share of the photos that a point is open to which must see through it, and MIN_AGREEING of them: a surface that is
+# wrong itself lies behind good points in some photos; a point that is not there has surfaces behind it in many.
+THROUGH_SHARE = 0.2
 # Points of both sides show the same place within so many of their common standard deviations, or so many spacings of
 # the sparser side where that is more; never farther than twice the RESOLUTION.
 SAME_PLACE_DEVIATIONS, SAME_PLACE_SPACINGS = 5.0, 1.5
@@ -81,12 +82,12 @@ def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.
     reason = np.zeros(len(scene.cloud), np.uint8)
     # What is measured stays: all photos of a pot before a wall have the wall behind it.
     is_open = seen.in_view - seen.hidden
-    through = seen.through >= np.maximum(THROUGH_PHOTOS, THROUGH_SHARE * is_open)
+    through = seen.through >= np.maximum(MIN_AGREEING, THROUGH_SHARE * is_open)
     reason[through & ~scene.surface] = Reason.SEEN_THROUGH
 
     both = concatenate([surface, scene.cloud[scene.surface]])
     behind = see(obj.cloud.points, both, views, spacing(both.points), MARGIN * diagonal)
-    contradicted = ~obj.surface & (behind.through >= THROUGH_PHOTOS)
+    contradicted = ~obj.surface & (behind.through >= MIN_AGREEING)
 
     worse, better = better_measured(obj, scene, diagonal, share)
     reason[worse & (reason == Reason.KEPT)] = Reason.REPLACED

@@ -15,12 +15,12 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
-from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, THROUGH_PHOTOS, THROUGH_SHARE
+from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, THROUGH_SHARE
 from scenefuse.fuse.measure import RESOLUTION
 from scenefuse.geometry.depth_test import see, shown_in
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, match_in
-from scenefuse.geometry.photo_kernel import NOISE
-from scenefuse.geometry.visual_hull import Outline, count_silhouettes
+from scenefuse.geometry.photo_kernel import MIN_AGREEING, NOISE
+from scenefuse.geometry.visual_hull import MAX_WRONG_SHARE, Outline, count_silhouettes
 from scenefuse.photos.workspace import View
 
 
@@ -34,8 +34,6 @@ class Lack(IntEnum):
 
 # So many cells around the object's points are looked at too.
 BORDER_CELLS = 3
-# Share of the photos that may have a place of the hull outside their mask: masks err.
-MAX_OFF_MASK = 0.1
 # Cells beside each other that count: smaller spots are between points, not missing.
 MIN_SPOT_CELLS = 12
 # Quantile of the distances between a surface's points that depth buffers go by: sparse parts have no holes then.
@@ -89,7 +87,7 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     step = spacing(surface.points, quantile=SPARSEST)
     apart = cKDTree(surface.points).query(obj.points, workers=threads())[0] > SAME_PLACE_SPACINGS * side
     loose = _plain(obj[apart])
-    through = see(loose.points, surface, views, step, margin).through >= THROUGH_PHOTOS
+    through = see(loose.points, surface, views, step, margin).through >= MIN_AGREEING
     through |= _off_masks(loose.points, masks)
     loose = loose[~through]
     if len(loose):
@@ -157,11 +155,11 @@ def _frontier(
     """Cells of unknown space that border on empty space, and for every cell the direction towards empty space."""
     centres = grid.centres
     shown, off, *_ = count_silhouettes(centres, map(Outline, masks))
-    in_hull = (shown >= CONFIRMING_PHOTOS) & (off <= MAX_OFF_MASK * shown)
+    in_hull = (shown >= CONFIRMING_PHOTOS) & (off <= MAX_WRONG_SHARE * shown)
     seen = see(centres, surface, views, step, margin)
     # Off the masks nothing of the object is, where photos see the place at all; below the ground few do, through gaps.
-    in_sight = seen.in_view - seen.hidden >= np.maximum(THROUGH_PHOTOS, THROUGH_SHARE * seen.in_view)
-    empty = (seen.through >= THROUGH_PHOTOS) | (~in_hull & in_sight)
+    in_sight = seen.in_view - seen.hidden >= np.maximum(MIN_AGREEING, THROUGH_SHARE * seen.in_view)
+    empty = (seen.through >= MIN_AGREEING) | (~in_hull & in_sight)
     bare = ~grid.within(surface.points, SAME_PLACE_SPACINGS * grid.side)
     free = empty.reshape(grid.shape) & bare
     unknown = (in_hull & ~empty).reshape(grid.shape) & bare
@@ -173,7 +171,7 @@ def _frontier(
 def _off_masks(points: Array, masks: list[View]) -> NDArray[np.bool_]:
     """(N,) points that three photos have in their frame, and too many of these outside the mask."""
     shown, off, *_ = count_silhouettes(points, map(Outline, masks))
-    return np.asarray((shown >= CONFIRMING_PHOTOS) & (off > MAX_OFF_MASK * shown))
+    return np.asarray((shown >= CONFIRMING_PHOTOS) & (off > MAX_WRONG_SHARE * shown))
 
 
 def _in_spots(missing: Grid) -> Grid:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenefuse.core.transforms import Array
+from scenefuse.core.transforms import SD_OVER_MEDIAN, Array
 from scenefuse.geometry.icp import MAX_TRIPLES
 
 # Cells along each side of the square around the ring; one low point stands for each, and half as many fix the ground.
@@ -81,7 +81,8 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
     off = off[np.abs(off) < 4 * tolerance]
     if len(off):
         coefficients[0] += float(np.median(off))
-        tolerance = float(np.clip(2.5 * 1.4826 * np.median(np.abs(off - np.median(off))), tolerance, 3 * tolerance))
+        spread = SD_OVER_MEDIAN * np.median(np.abs(off - np.median(off)))
+        tolerance = float(np.clip(2.5 * spread, tolerance, 3 * tolerance))
     return Ground(coefficients, centre, tolerance)
 
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import threads
-from scenefuse.core.transforms import Array, Sim3, fit_sim3
+from scenefuse.core.transforms import SD_OVER_MEDIAN, Array, Sim3, fit_sim3
 from scenefuse.geometry.surface import SAMPLED_POINTS, Pairs, Surface, color_gain, pair
 
 # Weight of point-to-point rows beside point-to-plane rows: enough to stop sliding, too little to hold planes back.
@@ -239,7 +239,7 @@ def _weighted(lever: Array, direction: Array, residual: Array, weight: Array) ->
 
     Residuals are divided by their robust spread, so that kinds of rows can be added.
     """
-    spread = 1.4826 * np.median(np.abs(residual - np.median(residual))) + 1e-12
+    spread = SD_OVER_MEDIAN * np.median(np.abs(residual - np.median(residual))) + 1e-12
     weight = weight * np.minimum(1, 2 * spread / np.maximum(np.abs(residual), 1e-12)) / spread**2
     jacobian = similarity_rows(lever, direction)
     weighted = weight[:, None] * jacobian

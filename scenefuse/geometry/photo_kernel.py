@@ -14,6 +14,8 @@ OTHERS = 10
 # Photos that must confirm a point for it to be measured; as many of the others count at each offset, since the rest
 # may not see the place (Goesele et al. 2006).
 CONFIRMING_PHOTOS = 3
+# Photos or depth maps that must agree where one may by chance.
+MIN_AGREEING = 2
 # Grey levels over which a sample's weight falls: across an edge a patch does not mix two surfaces (Yoon, Kweon 2006).
 GREY_FALL = 25.0
 # Photos that look along a surface (beyond 75 degrees) show little of it.
@@ -23,7 +25,8 @@ MIN_COSINE = 0.25
 MIN_ANGLE, GOOD_ANGLE, MAX_ANGLE = math.radians(3), math.radians(12), math.radians(60)
 # Photos that a point is seen from as reference, one after the other, and the least angle between them; no other one is
 # tried where it and as many as count confirm the point.
-REFERENCES, REFERENCE_ANGLE = 3, math.radians(20)
+REFERENCES = CONFIRMING_PHOTOS
+REFERENCE_ANGLE = math.radians(20)
 # Grey levels (one standard deviation) that a photo's pixels are off at least.
 NOISE = 1.5
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
+from scenefuse.cloud.cloud_file import STRAY_PERCENT
 from scenefuse.cloud.clouds import Cloud, plane_normals, voxel_average
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
@@ -151,6 +152,11 @@ def _color_slopes(surface: Surface, neighbours: int = 20) -> Array:
     right = np.einsum("nki,nkc->nic", offset, change)
     solved = np.linalg.solve(normal_matrix + 1e-3 * scale * np.eye(3), right)
     return np.swapaxes(solved, 1, 2)
+
+
+def ends_of(places: Array) -> Array:
+    """(2, ...) where points end, by their places (N, ...) along directions; strays do not count."""
+    return np.percentile(places, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
 
 
 @dataclass(frozen=True)

@@ -13,15 +13,19 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from scenefuse.core.transforms import Array
+from scenefuse.geometry.photo_kernel import MIN_AGREEING
 from scenefuse.photos.workspace import View
 
 Mask = NDArray[np.bool_]
 Counts = NDArray[np.int32]
 
-# Photos that must frame a place: a share of those that frame this percentile of the object's own points; never fewer.
-MIN_FRAMING_SHARE, FRAMING_PERCENTILE, MIN_PHOTOS = 0.25, 10, 2
+# Photos that must frame a place: a share of those that frame this percentile of the object's own points, and
+# MIN_AGREEING.
+MIN_FRAMING_SHARE, FRAMING_PERCENTILE = 0.25, 10
 # With fewer own points, the photos that show the object whole count, or this share of all photos.
 MIN_OWN_POINTS, MIN_WHOLE_SHARE = 20, 1 / 3
+# Share of the photos that may have a place of the hull outside their mask: masks err.
+MAX_WRONG_SHARE = 0.1
 NO_POINTS: Array = np.zeros((0, 3))
 
 
@@ -138,7 +142,7 @@ def least_framing(views: Sequence[View], own: Array, share: float = MIN_FRAMING_
         usual = float(np.percentile(framed, FRAMING_PERCENTILE))
     else:
         usual = max(sum(is_whole(view.pixels) for view in views), MIN_WHOLE_SHARE * len(views))
-    return max(MIN_PHOTOS, int(np.ceil(share * usual)))
+    return max(MIN_AGREEING, int(np.ceil(share * usual)))
 
 
 def is_whole(mask: Mask) -> bool:

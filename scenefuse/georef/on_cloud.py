@@ -11,7 +11,7 @@ import pyproj
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.cloud_file import STRAY_PERCENT, CloudFile
+from scenefuse.cloud.cloud_file import CloudFile
 from scenefuse.cloud.clouds import spacing
 from scenefuse.cloud.crs import check_place, grid_name, to_wgs84, usable
 from scenefuse.cloud.formats import readable
@@ -21,6 +21,7 @@ from scenefuse.core.stage import StageError, quantity, threads, value
 from scenefuse.core.transforms import Array, Sim3, box_corners, rotation_angle_deg
 from scenefuse.geometry.icp import refine_on_cloud
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
+from scenefuse.geometry.surface import ends_of
 from scenefuse.georef.placement import middle_of
 from scenefuse.georef.residuals import Georeference
 from scenefuse.photos.geodesy import LocalFrame
@@ -195,7 +196,7 @@ def in_local(points: Array, crs: pyproj.CRS, frame: LocalFrame, where: Path) -> 
 
 def _beside(cloud: Path, own: Array, crs: pyproj.CRS, frame: LocalFrame) -> Array:
     """The points (N, 3) of a cloud that lie over or near a model (M, 3), in the scene's frame."""
-    low, high = np.percentile(own, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
+    low, high = ends_of(own)
     corners = frame.in_crs(box_corners(low - MAX_GPS_ERROR_M, high + MAX_GPS_ERROR_M))
     low, high = corners.min(0), corners.max(0)
     low[2], high[2] = -np.inf, np.inf
@@ -237,7 +238,7 @@ def _onto(cloud: Array, own: Array, name: str) -> Sim3:
 
 def _over(cloud: Array, own: Array) -> NDArray[np.bool_]:
     """(M,) which points of a model lie over a cloud (N, 3)."""
-    low, high = np.percentile(cloud[:, :2], [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
+    low, high = ends_of(cloud[:, :2])
     return np.asarray(((own[:, :2] >= low) & (own[:, :2] <= high)).all(1))
 
 
@@ -257,7 +258,7 @@ def _seen(points: Array, views: list[View]) -> float:
 
 def _in_box_of(points: Array, own: Array) -> Array:
     """Those of a model's points (M, 3) that are in the box of a cloud (N, 3)."""
-    low, high = np.percentile(points, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
+    low, high = ends_of(points)
     return own[((own >= low) & (own <= high)).all(1)]
 
 

@@ -7,7 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, setting
-from scenefuse.core.transforms import SD_OVER_MEDIAN, UP, Sim3, fit_sim3, fit_sim3_robust, rotation_between
+from scenefuse.core.transforms import (
+    MAX_DEVIATIONS,
+    SD_OVER_MEDIAN,
+    UP,
+    Sim3,
+    fit_sim3,
+    fit_sim3_robust,
+    rotation_between,
+)
 from scenefuse.georef.control import MIN_CONTROL_POINTS, LocatedPoint, check_spread, describe_misses
 from scenefuse.photos.geodesy import MAX_MEDIAN_DISTANCES
 from scenefuse.sfm.gravity import MAX_VERTICAL_SD_DEG
@@ -16,12 +24,10 @@ Array = NDArray[np.float64]
 
 # Fewer registered photos with GPS do not show which of them is an outlier.
 MIN_GPS_PHOTOS = 5
-# In standard errors of a position: what is farther from its camera is an outlier; a flight that spreads less says
-# nothing about scale; one that is narrower lies along one line and says nothing about roll.
-OUTLIER_SD = 4.0
-# Heights of GPS have twice the error of the plane, and so many photos beside each other have one error.
+# Heights of GPS have twice the error of the plane. Errors drift slowly: so many photos beside each other have one.
 HEIGHT_ERROR, PHOTOS_OF_ONE_ERROR = 2.0, 5.0
-# How far a model that was not yet adjusted to exact positions may be bent away from them, as a share of their extent.
+# How far a model may be bent, as a share of its extent: away from exact positions before it is adjusted to them, and
+# an object's before its pose is of no use.
 MAX_BENT = 0.1
 # Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
 MAX_GPS_OFF_M = 1000.0
@@ -109,7 +115,7 @@ def place_by_control(
     whole = np.isfinite(there).all(1)
     check_spread(there[whole], [n for n, w in zip(names, whole) if w], where)
     sd_m = max(max(located[k].point.sd_m) for k in rows)
-    limit = max(OUTLIER_SD * sd_m, MAX_BENT * float(np.linalg.norm(np.ptp(there[whole], axis=0))))
+    limit = max(MAX_DEVIATIONS * sd_m, MAX_BENT * float(np.linalg.norm(np.ptp(there[whole], axis=0))))
     try:
         fitted, inliers = fit_measured(start, there, limit, seed)
     except ValueError:
@@ -198,7 +204,7 @@ def beside_gps(
 
 def _limit(sd_m: float, extent: float, settings: GeoreferenceSettings) -> float:
     """How far a position may be from its camera after a similarity: its noise, or for exact ones the model's bend."""
-    return max(OUTLIER_SD * sd_m, min(OUTLIER_SD * settings.gps_accuracy_m, MAX_BENT * extent))
+    return max(MAX_DEVIATIONS * sd_m, min(MAX_DEVIATIONS * settings.gps_accuracy_m, MAX_BENT * extent))
 
 
 def middle_of(difference: Array) -> Array:
@@ -226,7 +232,7 @@ def place_by_gps(
     """
     accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target)
     limit = _limit(accuracy_m, extent[0], settings)
-    if extent[0] < OUTLIER_SD * accuracy_m:
+    if extent[0] < MAX_DEVIATIONS * accuracy_m:
         reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {accuracy_m:g} m"
         return upright(up, reason)
     fitted, inliers, levelled = _fit(centres, target, up, accuracy_m, limit, seed, sure_up)
@@ -235,7 +241,7 @@ def place_by_gps(
         return upright(up, reason)
     reason = f"{inliers.sum()} of {len(target)} photos by GPS"
     if levelled:
-        line = "along one line, " if _extent(target[inliers])[1] < OUTLIER_SD * accuracy_m else ""
+        line = "along one line, " if _extent(target[inliers])[1] < MAX_DEVIATIONS * accuracy_m else ""
         reason += f", {line}levelled by the cameras"
     unknown = np.isnan(target[:, 2])
     if unknown.all():
@@ -252,7 +258,7 @@ def _fit(
     has_height = np.isfinite(target[:, 2])
 
     def fixes_tilt(rows: NDArray[np.bool_]) -> bool:
-        return bool(rows.sum() >= MIN_GPS_PHOTOS and _extent(target[rows])[1] >= OUTLIER_SD * accuracy_m)
+        return bool(rows.sum() >= MIN_GPS_PHOTOS and _extent(target[rows])[1] >= MAX_DEVIATIONS * accuracy_m)
 
     def leans(fitted: Sim3, rows: NDArray[np.bool_]) -> bool:
         lean = np.degrees(np.arccos(np.clip(fitted.rotate(up)[2] / np.linalg.norm(up), -1, 1)))

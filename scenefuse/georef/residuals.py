@@ -10,9 +10,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import atomic_file, quantity
-from scenefuse.core.transforms import Array
+from scenefuse.core.transforms import MAX_DEVIATIONS, Array
 from scenefuse.georef.control import Control, LocatedPoint, seen_at
-from scenefuse.georef.placement import OUTLIER_SD, GpsCameras, Placement
+from scenefuse.georef.placement import GpsCameras, Placement
 from scenefuse.marks.triangulation import Lengths
 from scenefuse.photos.geodesy import LocalFrame
 
@@ -177,7 +177,7 @@ def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str
     sd_m = np.array([s.point.sd_m for s in control.located]).reshape(-1, 2)
     horizontal = np.linalg.norm(left.points[:, :2], axis=1) / sd_m[:, 0]
     ratio = np.where(used, np.fmax(horizontal, np.abs(left.points[:, 2]) / sd_m[:, 1]), 0.0)
-    worst = [k for k in np.argsort(-ratio) if ratio[k] > OUTLIER_SD]
+    worst = [k for k in np.argsort(-ratio) if ratio[k] > MAX_DEVIATIONS]
     if not worst:
         return []
     named = [
@@ -185,8 +185,8 @@ def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str
         for k in worst[:3]
     ]
     return [
-        f"{len(worst)} of {used.sum()} control points are more than {OUTLIER_SD:g} stated standard deviations off, in"
-        f" metres: {', '.join(named)}; correct coordinates and clicks, or state larger deviations in columns 8 and 9"
+        f"{len(worst)} of {used.sum()} control points are more than {MAX_DEVIATIONS:g} stated standard deviations off,"
+        f" in metres: {', '.join(named)}; correct coordinates and clicks, or state larger deviations in columns 8 and 9"
     ]
 
 

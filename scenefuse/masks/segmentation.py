@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, setting
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.visual_hull import Hull, Mask, carve, mask_iou, silhouette
+from scenefuse.geometry.visual_hull import MAX_WRONG_SHARE, Hull, Mask, carve, mask_iou, silhouette
 from scenefuse.marks.clicks import Clicks, ScenePoints
 from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks, clicks_per_photo
 from scenefuse.marks.triangulation import marked_size, triangulate_consistent
@@ -24,9 +24,9 @@ from scenefuse.masks.stereo_points import with_stereo_points
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
 from scenefuse.photos.workspace import View, Workspace, read_model
 
-# Share of the photos that may contradict a voxel of the hull, as some masks are wrong somewhere; the same for GrabCut's
-# first masks, and for another hull by which masks are compared: where many lack a part, they would carve it away.
-MAX_WRONG_SHARE, MAX_LACKING_SHARE = 0.1, 0.34
+# As MAX_WRONG_SHARE, for GrabCut's first masks, and for another hull by which masks are compared: where many lack a
+# part, they would carve it away.
+MAX_LACKING_SHARE = 0.34
 # Share of the median mask's agreement with the hull below which SAM 2 makes a mask once more.
 MIN_SHARE_OF_MEDIAN = 0.9
 NOTHING: Mapping[int, PhotoClicks] = {}

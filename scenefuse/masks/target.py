@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay
 
+from scenefuse.cloud.cloud_file import STRAY_PERCENT
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.ground import Ground, fit_ground
@@ -24,8 +25,6 @@ SPANNING_POINTS = 64
 GROUND_REACH_HALF_WIDTHS = 1.5
 # How far a ground point may lie off the fitted surface, as a share of the box's diagonal: grass, gravel, errors of SfM.
 GROUND_SCATTER_SHARE = 0.02
-# Percentage of the object's points at each side, along each axis, that may be mismatched.
-OUTERMOST_PERCENT = 1.0
 # Sparse points on the object that masks have to hold: fewer do not show its extent.
 MIN_OBJECT_POINTS = 10
 
@@ -137,8 +136,8 @@ def without_outermost(points: Array) -> Array:
     """Of (N, 3) points of the object those that are not the outermost along an axis, where there are many."""
     if not len(points):
         return points
-    low = np.percentile(points, OUTERMOST_PERCENT, axis=0, method="lower")
-    high = np.percentile(points, 100 - OUTERMOST_PERCENT, axis=0, method="higher")
+    low = np.percentile(points, STRAY_PERCENT, axis=0, method="lower")
+    high = np.percentile(points, 100 - STRAY_PERCENT, axis=0, method="higher")
     return points[((points >= low) & (points <= high)).all(1)]
 
 

@@ -13,13 +13,11 @@ from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.prompts import POINT_RADIUS_SHARE, Measure, Prompts, distance_to, pixel_of
 from scenefuse.masks.target import MIN_OBJECT_POINTS, in_hull, without_outermost
-from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
+from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS, MIN_AGREEMENT
 from scenefuse.photos.workspace import Workspace
 
 # Points that a photo, or a click outside, is known by.
 MIN_KNOWN_POINTS = 4
-# Agreement of a mask with its prompts from which it votes, and of the votes on a point from which it is known.
-MIN_AGREEMENT = 0.8
 
 
 @dataclass

@@ -24,8 +24,8 @@ FALLOFF_DEG = (4.0, 10.0)
 MAX_TRIANGLE_SIDE = 0.06
 # Sparse points off the mask, but this near to it, may be the object's: they are left out.
 MASK_REACH_PX = 2
-# Share of the photos that observe a sparse point of the object that have it on their masks.
-MIN_ON_MASK_SHARE = 0.8
+# Share of the masks that must agree on a sparse point, of those in whose photos it is observed.
+MIN_AGREEMENT = 0.8
 # What hides a point of the object is this much nearer, as a share of its depth: between such points it may bulge.
 BULGE_SHARE = 0.02
 
@@ -133,7 +133,7 @@ def own_points(views: Views) -> NDArray[np.bool_]:
         rows, on_mask, _ = beside_mask(views, index, views.tracks[index])[:3]
         seen[rows] += 1
         on[rows[on_mask]] += 1
-    return (on >= CONFIRMING_PHOTOS) & (on >= MIN_ON_MASK_SHARE * seen)
+    return (on >= CONFIRMING_PHOTOS) & (on >= MIN_AGREEMENT * seen)
 
 
 def beside_mask(

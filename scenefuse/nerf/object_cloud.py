@@ -12,10 +12,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, concatenate, plane_normals, spacing, voxel_downsample, write_cloud
+from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, write_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, write_json
 from scenefuse.geometry.consistency import compare, extent, surface_points
+from scenefuse.geometry.surface import normals_at
 from scenefuse.mvs.dense_cloud import near_others
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.sparse_depths import MASK_REACH_PX, sparse_depths
@@ -30,8 +31,6 @@ Maps = NDArray[np.float32]
 MIN_POINTS = 100
 # Points belong to one group where steps of this many spacings lead from one to the other.
 MAX_STEP = 3
-# Points that a normal's plane is fitted to.
-PLANE_POINTS = 16
 
 
 @dataclass(frozen=True)
@@ -197,8 +196,7 @@ def clean(cloud: Cloud, min_component: float, step: float) -> Cloud:
 
 def with_plane_normals(cloud: Cloud) -> Cloud:
     """Normals of local planes through the nearest points, on the side of the rendered normals they replace."""
-    index = cKDTree(cloud.points).query(cloud.points, k=min(PLANE_POINTS, len(cloud)), workers=threads())[1]
-    normal = plane_normals(cloud.points, index)
+    normal = normals_at(cloud.points, cloud.points)
     if cloud.normals is not None:
         normal *= np.where((normal * cloud.normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
     return Cloud(cloud.points, normal.astype(np.float32), cloud.colors, cloud.fields)

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from scenefuse.core.stage import StageError
+from scenefuse.geometry.surface import ends_of
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.sparse_depths import beside_mask, own_points, pair_worth
 from scenefuse.nerf.monodepth import disparity_from_depth, points_in_cam
@@ -21,8 +22,6 @@ from scenefuse.photos.workspace import View
 
 # Every tenth SfM point is kept from training, to measure with.
 CHECK_EVERY = 10
-# Depth range and box around the object span these percentiles of the points.
-PERCENTILES = (1, 99)
 # The depth range is widened at both ends by this share of it.
 RANGE_MARGIN = 0.15
 # Kept around a mask's box, share of the box: windows and warps at the outline need pixels beyond it.
@@ -166,9 +165,9 @@ def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhoto
             f"only {len(on_object)} SfM points lie on the object in all photos; depth needs at least 8: "
             "check that the masks show the object, and that the photos are sharp"
         )
-    low, high = np.percentile(views.sparse[on_object], PERCENTILES, axis=0)
+    low, high = ends_of(views.sparse[on_object])
     depths = np.concatenate([pixels[:, 2] for _, pixels in seen])
-    closest, farthest = np.percentile(depths, PERCENTILES)
+    closest, farthest = ends_of(depths)
     margin = RANGE_MARGIN * (farthest - closest) + 1e-3 * farthest  # a range of its own where all depths are equal
 
     def as_tensor(array: NDArray[np.generic]) -> Tensor:

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, quantity, threads, value, write_json
 from scenefuse.geometry.consistency import compare, extent, surface_points
+from scenefuse.geometry.photo_kernel import MIN_AGREEING
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.photos.pictures import read_depth, write_depth
 from scenefuse.photos.views import Views, load_views
 
 # Two depths of one place agree within this share of the object's diagonal.
 MAP_AGREEMENT = 0.005
-# Other views that have to have the same surface: one may agree by chance.
-CONFIRMING_VIEWS = 2
 SHIPPED = RefinementSettings()
 
 Maps = NDArray[np.float32]
@@ -62,8 +61,8 @@ def confirm(
     matched = refine_by_photos(seen, before, settings)
     kept = np.where(matched.inconsistent, 0, matched.depths).astype(np.float32)
     agree, through, _ = agreement(seen, kept, map_agreement)
-    share = np.where(matched.moved, 1, agree / np.maximum(agree + through, CONFIRMING_VIEWS))
-    share = np.where(agree >= CONFIRMING_VIEWS, share, 0).astype(np.float32)
+    share = np.where(matched.moved, 1, agree / np.maximum(agree + through, MIN_AGREEING))
+    share = np.where(agree >= MIN_AGREEING, share, 0).astype(np.float32)
     prior = DepthPrior(depths * views.masks, np.zeros_like(depths))
     prior.depths[training], prior.confidence[training] = kept, share
     there, masked = max(int((before > 0).sum()), 1), max(int(seen.masks.sum()), 1)

@@ -12,9 +12,10 @@ from torch import Tensor
 from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.consistency import normals_from_depth
+from scenefuse.geometry.photo_kernel import MIN_AGREEING
 from scenefuse.nerf.appearance import DEPTH_JUMP, MIN_OPACITY, falloff_map, fitted_log_gain, gains_nearby
 from scenefuse.nerf.rays import SURFACE_DEPTH, PhotoTensors, dilate
-from scenefuse.nerf.refine_depth import CONFIRMING_VIEWS, MAP_AGREEMENT, agreement
+from scenefuse.nerf.refine_depth import MAP_AGREEMENT, agreement
 from scenefuse.nerf.render import RenderedView, render_view
 from scenefuse.nerf.training import Nerf
 from scenefuse.photos.pictures import write_depth, write_normals, write_picture
@@ -102,7 +103,7 @@ def render_maps(
         )
     agree, through, diagonal = agreement(views, depths, settings.map_agreement)
     opacity = np.stack([view.opacity.numpy() for view in rendered]).clip(0, 1)
-    confidence = (agree / np.maximum(agree + through, CONFIRMING_VIEWS) * opacity).astype(np.float32)
+    confidence = (agree / np.maximum(agree + through, MIN_AGREEING) * opacity).astype(np.float32)
     return RenderedMaps(views, depths, confidence, rendered, log_gain, looks[1], measured, diagonal)
 
 

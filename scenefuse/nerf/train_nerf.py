@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.geometry.surface import ends_of
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
@@ -174,7 +175,7 @@ def _sheet_row(photo: Path, masks: Path, stage: Path) -> list[Image]:
     cut_out = (picture * (matte[..., None] / 255.0) + 0.5).astype(np.uint8)
     depth = read_depth(stage / "depth_maps" / f"{photo.name}.bin")
     known = depth[depth > 0]
-    low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
+    low, high = ends_of(known) if len(known) else (0.0, 1.0)
     normals = read_normals(stage / "normal_maps" / f"{photo.name}.bin")
     return [cut_out, render, depth_colors(depth, float(low), float(high)), _normal_colors(normals)]
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
+from scenefuse.geometry.surface import ends_of
 from scenefuse.geometry.visual_hull import (
     MIN_OWN_POINTS,
     MIN_WHOLE_SHARE,
@@ -123,7 +124,7 @@ def _rough_cube(views: list[View], own: Array) -> Sim3:
     what masks show of a facade has neither its middle nor its extent."""
     if len(own) < MIN_OWN_POINTS or sum(is_whole(view.pixels) for view in views) >= MIN_WHOLE_SHARE * len(views):
         return cube_from_cameras(views)
-    low, high = np.percentile(own, [1, 99], axis=0)
+    low, high = ends_of(own)
     side = float((high - low).max() + 2 * ROUGH_MARGIN * np.linalg.norm(high - low))
     return Sim3(1 / side, np.eye(3), 0.5 - (low + high) / (2 * side))
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import quantity, write_json
-from scenefuse.core.transforms import Array, Sim3, fit_sim3
+from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3, fit_sim3
 from scenefuse.geometry.icp import MAX_TRIPLES, RANSAC_POSES, triples_of_one_scale
 from scenefuse.register.gps import GpsPose, gps_quantities, pose_by_gps
 from scenefuse.register.landmarks import Landmarks, match_landmarks, read_landmarks
@@ -24,7 +24,7 @@ from scenefuse.register.reprojection import (
     minimise_reprojection,
     observations,
 )
-from scenefuse.register.uncertainty import MAX_DEVIATIONS, Uncertainty, uncertainty_quantities
+from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities
 
 # Random triples of matches drawn.
 RANSAC_SAMPLES = 100_000

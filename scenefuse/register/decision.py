@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import setting
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
-from scenefuse.geometry.surface import Surface
+from scenefuse.geometry.surface import Surface, ends_of
+from scenefuse.georef.placement import MAX_BENT
 from scenefuse.register.problem import Problem
-from scenefuse.register.repetition import ends_of
 from scenefuse.register.score import (
     DISTINCT_ANGLE_DEG,
     DISTINCT_SHIFT,
@@ -37,8 +37,6 @@ MAX_TILT_DEG = DISTINCT_ANGLE_DEG
 MAX_FREE_SPACE_VIOLATION = 0.25
 # A motion maps an object onto itself when its colours agree as much, beside the share of its points that meet others.
 MIN_SELF_COLOR = 0.9
-# The pose may be off by this share of the diagonal (`Uncertainty.size`) because the object's own model is bent.
-MAX_BENDING = 0.1
 
 
 @dataclass(frozen=True)
@@ -152,11 +150,11 @@ def unless_bent(decision: Decision, with_bending: Uncertainty | None, diagonal: 
         with_bending: the uncertainty with how far the object's model may be bent (method M10); None if unknown.
         diagonal: of the scene crop.
     """
-    if with_bending is None or not decision.registered or with_bending.size(diagonal) <= MAX_BENDING:
+    if with_bending is None or not decision.registered or with_bending.size(diagonal) <= MAX_BENT:
         return decision
     reason = (
         f"the object's model may be bent so far that it lies off by {with_bending.size(diagonal):.0%} of the diagonal, "
-        f"more than {MAX_BENDING:.0%}; take more photos between those of the object"
+        f"more than {MAX_BENT:.0%}; take more photos between those of the object"
     )
     return replace(decision, registered=False, reason=reason)
 

@@ -7,16 +7,12 @@ from typing import Any
 import numpy as np
 
 from scenefuse.core.stage import quantity, read_json, value
-from scenefuse.core.transforms import Array, Sim3
-from scenefuse.georef.placement import MIN_GPS_PHOTOS, GeoreferenceSettings, place_by_gps
+from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3
+from scenefuse.georef.placement import MIN_GPS_PHOTOS, PHOTOS_OF_ONE_ERROR, GeoreferenceSettings, place_by_gps
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.photos import gps_accuracies, gps_positions, read_photos
 from scenefuse.register.landmarks import Landmarks
-from scenefuse.register.uncertainty import MAX_DEVIATIONS
 from scenefuse.sfm.gravity import estimate_up
-
-# Errors of GPS drift slowly: so many photos that follow each other err alike.
-CORRELATED_PHOTOS = 5
 
 
 @dataclass(frozen=True)
@@ -88,7 +84,7 @@ def pose_by_gps(
     off = placed.local_from_model.apply(centres[placed.inliers])[:, :2] - there
     each = max(sd_m, float(np.sqrt((off**2).mean())))
     of_scene = float(np.hypot(_accuracy_of(scene_photos, accuracy_m), _off_in_plane(scene_json)))
-    turn = np.hypot(each / _extent(there), of_scene / _extent(_cameras(scene)[1][:, :2])) * np.sqrt(CORRELATED_PHOTOS)
+    turn = np.hypot(each / _extent(there), of_scene / _extent(_cameras(scene)[1][:, :2])) * np.sqrt(PHOTOS_OF_ONE_ERROR)
     # What all positions of a flight have in common is not averaged out by more photos.
     return GpsPose(placed.local_from_model, len(there), float(turn), float(np.hypot(each, of_scene)))
 

@@ -12,12 +12,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import threads
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3
 from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, moved_about, similarity_rows
 from scenefuse.geometry.surface import Surface
 from scenefuse.register.score import MIN_COLOR_NOISE, SCORE_FRACTION
-from scenefuse.register.uncertainty import MAX_DEVIATIONS, Uncertainty
+from scenefuse.register.uncertainty import Uncertainty
 
 # Object points from which a scene point may come: those within two deviations, at the usual spacing and noise.
 NEIGHBOURS = 24

@@ -6,12 +6,11 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import map_coordinates, maximum_filter
 
-from scenefuse.cloud.cloud_file import STRAY_PERCENT
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.depth_test import FreeSpace
 from scenefuse.geometry.icp import ScaleRange, refine_planes
-from scenefuse.geometry.surface import Surface
+from scenefuse.geometry.surface import Surface, ends_of
 from scenefuse.register.score import MIN_MARGIN, color_agreement, f_beta, worth
 
 # Edge of a voxel in spacings of the points; points agree within two edges.
@@ -141,11 +140,6 @@ def overlap(
     if free_space is not None:
         agreement *= 1 - (free_space.violation(pose.apply(obj.points[obj.queries])) or 0.0)
     return agreement
-
-
-def ends_of(places: Array) -> Array:
-    """(2, ...) where points end, by their places (N, ...) along directions; strays do not count."""
-    return np.percentile(places, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
 
 
 def multiples(obj: Surface, shift: Array) -> list[Array]:

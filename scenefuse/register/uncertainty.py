@@ -13,8 +13,6 @@ from scenefuse.geometry.surface import Surface
 
 # What a surface has wrong alike all over, as a share of how far two surfaces scatter about each other.
 COMMON_ERROR = 0.2
-# What is off by this many standard deviations is as likely something else: another place, another pose.
-MAX_DEVIATIONS = 4.0
 
 
 @dataclass(frozen=True)

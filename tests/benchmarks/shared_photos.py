@@ -19,7 +19,7 @@ from support.planted_photos import PhotoTrial, Truth, truth
 from scenefuse.core.stage import run, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.register.align_models import AlignmentSettings, align_landmarks
-from scenefuse.register.decision import MAX_BENDING, FineSettings
+from scenefuse.register.decision import MAX_BENT, FineSettings
 from scenefuse.register.uncertainty import Uncertainty, with_bending
 from scenefuse.sfm.spread import Spread, spread_of
 
@@ -71,7 +71,7 @@ def _compared(content: dict[str, Any], known: Truth, trial: PhotoTrial, spreads:
         deviation = np.sqrt(np.diag(stated.covariance))
         row |= off_by(name, pose, true, known.centre, trial.diagonal)
         row |= {f"{name}_over_sd_{k}": off for k, off in zip(AXES, deviations(pose, true, at) / deviation)}
-    return {**row, "strict": strict, "accepted": here.size(trial.diagonal) <= MAX_BENDING}
+    return {**row, "strict": strict, "accepted": here.size(trial.diagonal) <= MAX_BENT}
 
 
 def shared_photos(

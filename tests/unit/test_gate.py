@@ -235,7 +235,7 @@ def check_reported() -> None:
 def check_torn() -> None:
     """A model that may be bent beyond use is refused, and nothing else changes."""
     good = Decision(True, "good", "photos", 1.0, None, None)
-    bent = [Uncertainty.even(0, 0, gate.MAX_BENDING * DIAGONAL * factor) for factor in (0.999, 1.001)]
+    bent = [Uncertainty.even(0, 0, gate.MAX_BENT * DIAGONAL * factor) for factor in (0.999, 1.001)]
     assert unless_bent(good, None, DIAGONAL) is good and unless_bent(good, bent[0], DIAGONAL) is good
     torn = unless_bent(good, bent[1], DIAGONAL)
     assert not torn.registered and "10% of the diagonal" in torn.reason and "more photos" in torn.reason
