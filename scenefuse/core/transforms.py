@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 UP: Array = np.array([0.0, 0.0, 1.0])
 # Standard deviation of a normal error over the median of its size.
 SD_OVER_MEDIAN = 1.4826
+# Points that fix a similarity.
+FIXING_POINTS = 3
 # What is off by this many standard deviations is an outlier: another place, another pose, or a wrong measurement.
 MAX_DEVIATIONS = 4.0
 

@@ -13,14 +13,8 @@ from scenefuse.cloud.clouds import Cloud, spacing
 from scenefuse.core.stage import setting, threads
 from scenefuse.core.transforms import UP, Array, rotation_between
 from scenefuse.geometry.ground import Ground, fit_ground
+from scenefuse.geometry.surface import SCORE_FRACTION
 
-# The box is widened, beside `margin`, by two pairing distances of the registration: a share of its diagonal.
-MARGIN_FRACTION = 0.04
-# A part this near to a fiducial belongs to the object, and this near beside one that is below the surface nothing is
-# ground; as a share of the diagonal.
-REACH_FRACTION = 0.05
-# Points closer than this belong to one part, as a share of the diagonal of the fiducials' box.
-LINK_FRACTION = 0.03
 # A step is left out if less than this share of the points in the box would be left: the object is there.
 MIN_LEFT = 0.05
 # Parts with a smaller share of the points are left out.
@@ -33,8 +27,6 @@ FOOT_SHARE = 0.1
 MAX_RISE = float(np.tan(np.radians(20)))
 # Width of the ring around the box in which the ground is looked for, as a share of the marks' diagonal.
 RING_FRACTION = 0.5
-# Points lower than this above the ground are ground, as a share of the diagonal.
-GROUND_FRACTION = 0.015
 
 
 @dataclass(frozen=True)
@@ -112,13 +104,13 @@ def crop_cloud(
         inside = ((points >= low) & (points <= high)).all(1)
         return Crop(inside, inside, np.zeros_like(inside), "box", level, low, high, None, [])
     diagonal = float(np.linalg.norm(extent))
-    margin = settings.margin * extent + MARGIN_FRACTION * diagonal
+    margin = settings.margin * extent + 2 * SCORE_FRACTION * diagonal
     low, high = marks.min(0) - margin, marks.max(0) + margin
     ground, notes = ground_under(points, marks, low, high) if settings.remove_ground else (None, [])
     if ground is not None:
         # Fiducials are clicked where the scene shows the object; what it stands on bounds it below.
         corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
-        low[2] = min(low[2], ground.height(corners).min() - GROUND_FRACTION * diagonal)
+        low[2] = min(low[2], ground.height(corners).min() - SCORE_FRACTION * diagonal)
     in_box, shape = ((points >= low) & (points <= high)).all(1), settings.shape
     if shape == "hull":
         try:
@@ -147,8 +139,8 @@ def _without_loose_parts(
     rows = np.flatnonzero(inside)
     if not len(rows):
         return inside, []
-    link = max(LINK_FRACTION * diagonal, 3 * spacing(points[rows]))
-    near = _parts_near(points[rows], marks, link, REACH_FRACTION * diagonal)
+    link = max(2 * SCORE_FRACTION * diagonal, 3 * spacing(points[rows]))
+    near = _parts_near(points[rows], marks, link, 2 * SCORE_FRACTION * diagonal)
     if not near.any():
         return inside, ["no part in the box lies near a fiducial: all of them were kept"]
     if near.mean() < MIN_LEFT:
@@ -190,7 +182,7 @@ def ground_under(points: Array, marks: Array, low: Array, high: Array) -> tuple[
     foot, height = _foot(marks)
     limit, diagonal = foot[2] + FOOT_SHARE * height, float(np.linalg.norm(np.ptp(marks, axis=0)))
     reached = points[points[:, 2] <= limit + MAX_RISE * np.hypot(*(points - foot).T[:2])]
-    ground = fit_ground(reached, low, high, RING_FRACTION * diagonal, GROUND_FRACTION * diagonal)
+    ground = fit_ground(reached, low, high, RING_FRACTION * diagonal, SCORE_FRACTION * diagonal)
     if ground is None:
         return None, ["no ground was found around the box: nothing was removed as ground"]
     middle = (low[:2] + high[:2])[None] / 2
@@ -234,12 +226,12 @@ def on_ground(points: Array, marks: Array, ground: Ground, in_box: NDArray[np.bo
     level &= z <= foot[2] + FOOT_SHARE * height + uphill
     buried = marks[(under - marks[:, 2] > ground.tolerance) & (marks[:, 2] >= foot[2])]
     if len(buried):
-        level &= cKDTree(buried[:, :2]).query(xy, workers=threads())[0] > REACH_FRACTION * diagonal
+        level &= cKDTree(buried[:, :2]).query(xy, workers=threads())[0] > 2 * SCORE_FRACTION * diagonal
     rows = rows[level]
     around = ~in_box[rows] & (z >= surface - ground.tolerance)[level]
     found = np.zeros(len(points), dtype=bool)
     if around.any():
-        part_of, counts = parts(points[rows], max(LINK_FRACTION * diagonal, 3 * spacing(points[rows])))
+        part_of, counts = parts(points[rows], max(2 * SCORE_FRACTION * diagonal, 3 * spacing(points[rows])))
         continued = np.bincount(part_of, around, len(counts)) >= MIN_PART_SHARE * around.sum()
         found[rows] = continued[part_of]
     return found & in_box

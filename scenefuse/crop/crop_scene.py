@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.cloud.crs import to_wgs84
+from scenefuse.cloud.import_cloud import MIN_POINTS
 from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import UP, Array, Sim3
@@ -20,8 +21,6 @@ from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
 from scenefuse.marks.triangulation import locate
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
 
-# Fewer points than this give no features to register by.
-MIN_POINTS = 200
 MIN_FIDUCIALS = 4
 # Points of a scene in which an object is searched without any mark.
 MAX_WHOLE_POINTS = 10_000_000

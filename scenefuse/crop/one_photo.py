@@ -10,9 +10,8 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
-from scenefuse.core.transforms import Array
+from scenefuse.core.transforms import FIXING_POINTS, Array
 from scenefuse.crop.crop_cloud import (
-    LINK_FRACTION,
     MIN_PART_SHARE,
     STRAY_SHARE,
     Crop,
@@ -21,7 +20,7 @@ from scenefuse.crop.crop_cloud import (
     without_strays,
 )
 from scenefuse.geometry.depth_test import CELL_SPACINGS, SURFACE_SPACINGS
-from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
+from scenefuse.geometry.surface import NORMAL_NEIGHBOURS, SCORE_FRACTION
 from scenefuse.marks.clicks import Clicks
 from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
 from scenefuse.photos.workspace import View, read_views
@@ -29,8 +28,8 @@ from scenefuse.photos.workspace import View, read_views
 # What a click outside lies on is flat where the points around it have at most this surface variation; then it is what
 # lies as near to their plane as points of one part lie to each other.
 MAX_VARIATION = 0.02
-# Inside clicks with a depth that span an object, and points that are no strays.
-MIN_INSIDE = 3
+# Inside clicks with a depth that lay an object down, and points that are no strays.
+MIN_INSIDE = FIXING_POINTS
 # The object reaches at most so much farther than its clicks, as a ratio of diagonals: clicks are spread over the side
 # that the photo shows. What is larger is connected with something else.
 MAX_GROWTH = 3.0
@@ -74,7 +73,7 @@ class SceneClicks:
             around = points[np.argsort(np.linalg.norm(points - click, axis=1), kind="stable")[:NORMAL_NEIGHBOURS]]
             spread, axes = np.linalg.eigh(np.cov(around.T))
             if spread[0] < MAX_VARIATION * spread.sum():
-                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < LINK_FRACTION * extent
+                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < 2 * SCORE_FRACTION * extent
             found |= own
         return found
 

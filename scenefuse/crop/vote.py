@@ -14,14 +14,12 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop.crop_cloud import without_strays
 from scenefuse.geometry.depth_test import CELL_SPACINGS, SURFACE_SPACINGS, Where, depth_buffer, depth_test
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MAX_PHOTOS
-from scenefuse.geometry.visual_hull import least_framing
+from scenefuse.geometry.visual_hull import MAX_BEYOND_POINTS, least_framing
 from scenefuse.mvs.sparse_depths import MASK_REACH_PX, MIN_SHARED_POINTS
 from scenefuse.photos.workspace import View, read_workspace, with_mask
 
 # Where the photos stand farther from the object than so many of its extents, what hides it there is not looked for.
 MAX_DISTANCE_EXTENTS = 4.0
-# How near one of the object's own SfM points must be, as a share of their extent.
-MAX_OWN_DISTANCE = 0.15
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: floa
     decided = shown >= CONFIRMING_PHOTOS
     is_object = decided & (framed >= least) & (inside >= min_share * shown)
     rows = np.flatnonzero(is_object)
-    reach = MAX_OWN_DISTANCE * float(np.linalg.norm(np.ptp(own, axis=0)))
+    reach = MAX_BEYOND_POINTS * float(np.linalg.norm(np.ptp(own, axis=0)))
     is_object[rows] = cKDTree(own).query(in_object[rows], workers=threads())[0] <= reach
     return Votes(is_object, decided & (inside < 0.5 * shown), scene_from_object.apply(own))
 

@@ -19,7 +19,7 @@ from scenefuse.fuse.fuse_object import photos_of
 from scenefuse.fuse.measure import RESOLUTION, with_normals
 from scenefuse.fuse.missing import Lack, Missing, find_missing_surface
 from scenefuse.fuse.modes import around
-from scenefuse.fuse.next_photos import CLEARANCE, Plan, plan_stations, reach_of_stations
+from scenefuse.fuse.next_photos import NEAR, Plan, plan_stations, reach_of_stations
 from scenefuse.fuse.write import added_by, read_changes, together
 from scenefuse.geometry.photo_check import Photos
 from scenefuse.photos.geodesy import GridFrame, LocalFrame, length_unit, scene_frame
@@ -127,7 +127,7 @@ def _surroundings(inputs: MissingInputs, obj: Cloud, reach: float) -> tuple[Clou
     for some in np.array_split(tiles, 1 + np.diff(scene.starts)[tiles].sum() // AT_ONCE):
         points = changes.left_of(*scene.read(some)).points
         outside = ((points < low - beside) | (points > high + beside)).any(1)
-        far.append(voxel_downsample(Cloud(points[outside]), CLEARANCE * obj.diagonal / 4).points)
+        far.append(voxel_downsample(Cloud(points[outside]), NEAR * obj.diagonal / 4).points)
     normals = np.zeros((sum(map(len, far)), 3), np.float32)
     normals[: len(near)] = near.normals
     return near, Cloud(np.concatenate(far), normals)

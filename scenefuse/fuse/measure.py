@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from scenefuse.cloud.cloud_file import NEIGHBOURS
 from scenefuse.cloud.clouds import Cloud, spacing
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
@@ -31,9 +32,12 @@ world, and an Evidence value."""
 # Share of the object's diagonal that fusion resolves: how far a point lies before or behind a surface to be seen
 # through or hidden, what its neighbours are, and the side of the cells in which missing surface is counted.
 RESOLUTION = 0.01
+# What is nearer to an object than this share of its diagonal is beside it: there the scene is compared with it, and no
+# camera can stand.
+NEAR = 0.05
 # A point is measured where photos confirm this share of it and its neighbours: here and there one matches by chance.
-# Neighbours are as many as a plane has within RESOLUTION, from MIN_ to MAX_NEIGHBOURS.
-SUPPORT, MIN_NEIGHBOURS, MAX_NEIGHBOURS = 0.5, 8, 64
+# Neighbours are as many as a plane has within RESOLUTION, from NEIGHBOURS to MAX_NEIGHBOURS.
+SUPPORT, MAX_NEIGHBOURS = 0.5, 64
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,7 @@ def supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> ND
         return measured
     step = spacing(points)
     on_plane = np.pi * (RESOLUTION * diagonal / step) ** 2 if step > 0 else MAX_NEIGHBOURS
-    count = min(int(np.clip(on_plane, MIN_NEIGHBOURS, MAX_NEIGHBOURS)) + 1, len(points))
+    count = min(int(np.clip(on_plane, NEIGHBOURS, MAX_NEIGHBOURS)) + 1, len(points))
     near = cKDTree(points).query(points[measured], k=count, workers=threads())[1]
     found = measured.copy()
     found[measured] = measured[near.reshape(-1, count)].mean(1) >= SUPPORT

@@ -18,6 +18,7 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, Reason, compare, gaps
 from scenefuse.fuse.measure import (
     FIELDS,
+    NEAR,
     Evidence,
     deviations_of_pose,
     measure,
@@ -31,8 +32,6 @@ from scenefuse.fuse.write import GAINS, MIN_PAIRS, SEAM_SPACINGS, Changes, feath
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, moved_photos
 from scenefuse.register.uncertainty import Uncertainty
 
-# The scene is compared in the object's box, widened by this share of its diagonal.
-NEAR = 0.05
 # Points of the scene around an object that are checked; of a denser scene a random choice, which the others follow.
 MAX_CHECKED = 1_000_000
 

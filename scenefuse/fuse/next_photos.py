@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample
 from scenefuse.core.transforms import UP, Array, look_at, rotation_between
+from scenefuse.fuse.measure import NEAR
 from scenefuse.fuse.missing import SPARSEST, Lack, Missing
 from scenefuse.geometry.depth_test import shown_in
 from scenefuse.geometry.photo_kernel import GOOD_ANGLE
@@ -21,8 +22,6 @@ from scenefuse.photos.workspace import View
 # Directions that are tried, spread evenly over a sphere around the object, at these distances, in those of its
 # close-ups.
 DIRECTIONS, DISTANCES = 120, (0.7, 1.0, 1.4)
-# Share of the object's diagonal that a camera stays away from the ground and everything else.
-CLEARANCE = 0.05
 # Stations at most, and the share of what is missing that one must add.
 MAX_STATIONS, MIN_GAIN = 6, 0.05
 
@@ -72,7 +71,7 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
     middle, distance = _close_ups_from(obj, close_ups)
     apart = np.linalg.norm(around.points - middle, axis=1)
     # What stands beside the object hides by depth buffers, the rest by lines of sight.
-    clearance, reach = CLEARANCE * obj.diagonal, (0.5 + 2 * CLEARANCE) * obj.diagonal
+    clearance, reach = NEAR * obj.diagonal, (0.5 + 2 * NEAR) * obj.diagonal
     beside = apart < reach
     if not beside.any():
         return Plan([], 0.0)

@@ -9,16 +9,14 @@ from scipy.spatial.transform import Rotation
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
 from scenefuse.crop.crop_scene import MIN_POINTS
+from scenefuse.fuse.measure import RESOLUTION
 from scenefuse.geometry.icp import ScaleRange, refine_planes
-from scenefuse.geometry.surface import SAMPLED_POINTS, Surface, with_queries
+from scenefuse.geometry.surface import SAMPLED_POINTS, SCORE_FRACTION, Surface, with_queries
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.likelihood import PIECES_ACROSS
 from scenefuse.register.score import DISTINCT_SCALE_LOG
 from scenefuse.register.uncertainty import Uncertainty
 
-# Pairs within these shares of the diagonal, one after the other: an object a few per cent off still settles. One that
-# would move by more than the first (RMS) is not where the registration put it.
-REACHES = (0.04, 0.02, 0.01)
 # An object that moves by more than this share of its diagonal was put at a wrong place, however certain that seemed. If
 # the poses of halves spread by more, the scale stays: a roof alone does not determine how large a house is.
 MIN_MISPLACED = FineSettings.max_translation_sd_fraction
@@ -46,25 +44,26 @@ def settle(
 
     Returns:
         settled_from_placed and the RMS distance that it moves the object's points, over the diagonal; None where a side
-        has too few points, or where they would move by more than the first of REACHES.
+        has too few points, or where they would move by more than twice SCORE_FRACTION: then the registration put it
+        elsewhere.
     """
     if min(len(obj), len(scene)) < MIN_POINTS:
         return None
     mine, theirs = _surface(obj, seed), _surface(scene, seed)
     pose, scales = _refined(mine, theirs, DISTINCT_SCALE_LOG, diagonal), ScaleRange(1.0, DISTINCT_SCALE_LOG)
-    spread = half_sampling(mine, theirs, pose, scales, REACHES[1] * diagonal, HALVES, seed)
+    spread = half_sampling(mine, theirs, pose, scales, SCORE_FRACTION * diagonal, HALVES, seed)
     if spread is None or spread.size(diagonal) > MIN_MISPLACED:
         pose = _refined(mine, theirs, 0.0, diagonal)
     moved = float(np.sqrt(((pose.apply(obj.points) - obj.points) ** 2).sum(1).mean())) / diagonal
     if certain is not None and moved <= MIN_MISPLACED and (spread is None or certain < spread.size(diagonal)):
         return Sim3.identity(), 0.0
-    return (pose, moved) if moved <= REACHES[0] else None
+    return (pose, moved) if moved <= 2 * SCORE_FRACTION else None
 
 
 def _refined(mine: Surface, theirs: Surface, scale_width: float, diagonal: float) -> Sim3:
-    """The pose after refinement with pairs that come nearer and nearer."""
+    """The pose after refinement with pairs that come nearer and nearer: an object a few per cent off still settles."""
     pose = Sim3.identity()
-    for reach in REACHES:
+    for reach in np.geomspace(2 * SCORE_FRACTION, RESOLUTION, 3):
         pose = refine_planes(mine, theirs, pose, ScaleRange(1.0, scale_width), reach * diagonal, rounds=10)
     return pose
 

@@ -16,6 +16,9 @@ from scenefuse.geometry.depth_test import Where, place
 from scenefuse.geometry.photo_check import MAX_PHOTOS
 from scenefuse.photos.workspace import View
 
+# Depths that differ by this share are of two surfaces: no slanted one has such a step.
+DEPTH_JUMP = 0.03
+
 
 @dataclass(frozen=True)
 class DepthAgreement:

@@ -25,8 +25,6 @@ from scenefuse.photos.workspace import View, posed_images, read_model, view_of
 # Side of a cell in spacings of the surface's points, so that a surface has no holes between them; and how many spacings
 # behind the nearest points a noisy surface still reaches.
 CELL_SPACINGS, SURFACE_SPACINGS = 2.0, 8.0
-# Cells of 3 x 3 that must hold a surface to say that a point is hidden behind it, or that a photo sees through it.
-MIN_CELLS = 7
 # Below this share of points with a measurement on their rays, depth maps tell nothing of an object.
 MIN_MEASURED = 0.1
 
@@ -140,7 +138,7 @@ def shown_in(
 
 def _surface_in(surface: Cloud, view: View, spacing: float, both_sides: bool = False) -> tuple[View, Array]:
     """The photo in cells: the least depth of the surface in the 3 x 3 cells around each, and the largest (H, W), where
-    MIN_CELLS of them hold some; 0 elsewhere."""
+    most of them hold some; 0 elsewhere."""
     assert surface.normals is not None
     towards = view.centre - surface.points
     facing = (surface.normals * towards).sum(1) > MIN_COSINE * np.linalg.norm(towards, axis=1)
@@ -148,7 +146,7 @@ def _surface_in(surface: Cloud, view: View, spacing: float, both_sides: bool = F
     height, width = buffer.pixels.shape
     padded = np.pad(buffer.pixels, 1)
     shifted = np.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])
-    known = (shifted > 0).sum(0) >= MIN_CELLS
+    known = (shifted > 0).mean(0) > 0.5
     least = np.where(shifted > 0, shifted, np.inf).min(0)
     return replace(buffer, pixels=np.where(known, least, 0.0)), np.where(known, shifted.max(0), 0.0)
 

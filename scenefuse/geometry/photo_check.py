@@ -20,8 +20,8 @@ MIN_MATCH, MAX_DROP = 0.6, 0.1
 # Largest standard deviation of a measured point in steps along the ray, of about a pixel: windows that match as well
 # farther on measure nothing, sky and blank walls above all.
 MAX_DEVIATION_PX = 1.2
-# Photos of one side that points are checked in at most, and the share of an object that a photo must show.
-MAX_PHOTOS, MIN_SHOWN_SHARE = 64, 0.02
+# Photos of one side that points are checked in at most.
+MAX_PHOTOS = 64
 # Of how far the best match lies from a point: the point is off by a part of it, the match by the rest. This and the
 # next two by the likelihood of the errors of the demo's house and sculpture, once aligned to the truth.
 PEAK_FACTOR = 0.6
@@ -92,7 +92,7 @@ def read_photos(workspace: Workspace, points: Array) -> Photos:
     shown = np.zeros((len(workspace.views), len(sample)), dtype=bool)
     for row, view in zip(shown, workspace.views):
         row[view.visible(sample)[0]] = True
-    rows = np.flatnonzero(shown.sum(1) > MIN_SHOWN_SHARE * len(sample))
+    rows = np.flatnonzero(shown.any(1))
     if len(rows) > MAX_PHOTOS:
         print(f"{MAX_PHOTOS} of the {len(rows)} photos that show the object are compared", flush=True)
         centres = np.array([workspace.views[k].centre for k in rows])

@@ -22,8 +22,11 @@ Counts = NDArray[np.int32]
 # Photos that must frame a place: a share of those that frame this percentile of the object's own points, and
 # MIN_AGREEING.
 MIN_FRAMING_SHARE, FRAMING_PERCENTILE = 0.25, 10
-# With fewer own points, the photos that show the object whole count, or this share of all photos.
-MIN_OWN_POINTS, MIN_WHOLE_SHARE = 20, 1 / 3
+# Fewer points on the object do not show its extent.
+MIN_OWN_POINTS = 10
+# How far an object reaches beyond the points known of it, as a share of their extent: these seldom mark its ends.
+# Prompts no farther apart enclose a part: close clicks mark the corners of a small one.
+MAX_BEYOND_POINTS = 0.15
 # Share of the photos that may have a place of the hull outside their mask: masks err.
 MAX_WRONG_SHARE = 0.1
 NO_POINTS: Array = np.zeros((0, 3))
@@ -124,7 +127,7 @@ def count_silhouettes(points: NDArray[Any], outlines: Iterable[Outline], beyond:
     return counts
 
 
-def least_framing(views: Sequence[View], own: Array, share: float = MIN_FRAMING_SHARE) -> int:
+def least_framing(views: Sequence[View], own: Array) -> int:
     """How many photos must have a place in their frame for it to be the object's, whatever they show there.
 
     A share of as many as have the places that the fewest have: of a long facade, or of a statue with many photos of its
@@ -133,7 +136,6 @@ def least_framing(views: Sequence[View], own: Array, share: float = MIN_FRAMING_
     Args:
         views: the photos, with masks as `pixels`.
         own: (N, 3) points on the object, of any number; where they are few, the photos that have it whole count.
-        share: of these photos.
     """
     if len(own) >= MIN_OWN_POINTS:
         framed = np.zeros(len(own), dtype=np.int64)
@@ -141,8 +143,8 @@ def least_framing(views: Sequence[View], own: Array, share: float = MIN_FRAMING_
             framed[view.visible(own)[0]] += 1
         usual = float(np.percentile(framed, FRAMING_PERCENTILE))
     else:
-        usual = max(sum(is_whole(view.pixels) for view in views), MIN_WHOLE_SHARE * len(views))
-    return max(MIN_AGREEING, int(np.ceil(share * usual)))
+        usual = max(sum(is_whole(view.pixels) for view in views), MIN_FRAMING_SHARE * len(views))
+    return max(MIN_AGREEING, int(np.ceil(MIN_FRAMING_SHARE * usual)))
 
 
 def is_whole(mask: Mask) -> bool:

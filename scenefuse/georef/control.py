@@ -14,7 +14,8 @@ import pyproj
 from scenefuse.cloud.crs import grid_name, read_crs, to_wgs84
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import comma_advice, read_lines
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3
+from scenefuse.geometry.surface import along_a_line
 from scenefuse.marks.clicks import Click, in_photos
 from scenefuse.marks.triangulation import MAX_CLICK_MISS, intersect, model_pixel, read_ends
 from scenefuse.photos.photo_files import SUFFIXES
@@ -23,10 +24,6 @@ from scenefuse.photos.photos import Photo
 if TYPE_CHECKING:
     import pycolmap
 
-# Fewest control points that fix a model.
-MIN_CONTROL_POINTS = 3
-# Control points lie along one line if none is farther from it than this share of their extent.
-MIN_WIDTH_SHARE = 0.01
 # A point whose name begins so is a check point, as OpenDroneMap's users mark it.
 CHECK = "CHK-"
 # Standard deviations of a point's coordinates, horizontal and vertical, where the file gives none: a GNSS receiver's.
@@ -215,10 +212,10 @@ def read_control_points(path: Path, model: pycolmap.Reconstruction, photos: list
     surveyed = read_control(path)
     located, notes = locate_points(surveyed, model, {p.name: (p.width, p.height) for p in photos})
     good = [s for s in located if not (s.problem or s.point.check) and np.isfinite(s.point.position).all()]
-    if len(good) < MIN_CONTROL_POINTS:
+    if len(good) < FIXING_POINTS:
         reasons = "; ".join(f"{s.point.name}: {s.problem}" for s in located if s.problem and not s.point.check)
         raise StageError(
-            f"{path}: {len(good)} control points with a height can be used, {MIN_CONTROL_POINTS} are needed"
+            f"{path}: {len(good)} control points with a height can be used, {FIXING_POINTS} are needed"
             f"{f' ({reasons})' if reasons else ''}; click more points, each in two photos or more"
         )
     return Control(path, grid_name(surveyed.crs), located, notes)
@@ -306,9 +303,7 @@ def off_px(position: Array, images: list[pycolmap.Image], pixels: Array) -> Arra
 
 def check_spread(target: Array, names: list[str], where: str) -> None:
     """StageError where points (N, 3; metres) lie at one place or along one line."""
-    centred = target - target.mean(0)
-    extent = np.linalg.svd(centred, compute_uv=False)
-    if extent[1] <= MIN_WIDTH_SHARE * extent[0] or extent[0] == 0:
+    if along_a_line(target):
         raise StageError(
             f"{where}: the control points {', '.join(names)} lie along one line, which leaves the model free to turn"
             " about it; add one beside the line"

@@ -16,7 +16,7 @@ from scenefuse.georef.control import Control, read_control_points
 from scenefuse.georef.on_cloud import lay_on_cloud
 from scenefuse.georef.placement import (
     MAX_GPS_OFF_M,
-    MIN_GPS_PHOTOS,
+    PHOTOS_OF_ONE_ERROR,
     GeoreferenceSettings,
     GpsCameras,
     Placement,
@@ -145,7 +145,7 @@ def georeference(
         seed: of RANSAC.
         sure_up: whether `up` is a measurement (`estimate_up`: "headings"), better than inexact heights.
     """
-    by_gps = settings.use_gps and len(gps.names) >= MIN_GPS_PHOTOS
+    by_gps = settings.use_gps and len(gps.names) >= PHOTOS_OF_ONE_ERROR
     if control is not None:
         positions = np.array([s.point.position for s in control.located])
         frame = replace(local_frame(positions), grid=control.grid)
@@ -159,7 +159,7 @@ def georeference(
         frame = local_frame(gps.positions)
         there, sd_m = frame.apply(gps.positions), float(np.median(gps.sd_m[:, 0]))
         return Georeference(place_by_gps(gps.centres, there, up, settings, seed, sd_m, sure_up), frame, gps)
-    reason = f"{len(gps.names)} registered photos have a GPS position, {MIN_GPS_PHOTOS} are needed"
+    reason = f"{len(gps.names)} registered photos have a GPS position, {PHOTOS_OF_ONE_ERROR} are needed"
     return Georeference(upright(up, reason if settings.use_gps else "GPS is switched off"), None, gps)
 
 

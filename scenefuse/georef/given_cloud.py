@@ -17,14 +17,14 @@ from scenefuse.cloud.readers.las import LAS_DIMENSIONS, las_crs
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
+from scenefuse.geometry.visual_hull import MAX_WRONG_SHARE
 from scenefuse.georef.on_cloud import FIT, check_fit, cloud_crs, fit_to_cameras, in_local, misfit
 from scenefuse.photos.cameras.given import read_place
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
 from scenefuse.photos.workspace import View, read_model, read_views, with_mask
 
-# A point of an object lies inside the masks in so many of the photos that frame it; masks are grown by this share of
-# the photo's width.
-MIN_INSIDE, MASK_MARGIN = 0.9, 0.005
+# Masks are grown by this share of the photo's width.
+MASK_MARGIN = 0.005
 
 
 def import_posed_cloud(
@@ -184,7 +184,7 @@ def inside_masks(points: Array, views: list[View]) -> NDArray[np.bool_]:
         rows, pixels, _ = view.visible(points)
         framed[rows] += 1
         inside[rows] += view.pixels[pixels[:, 1], pixels[:, 0]]
-    return np.asarray((framed >= CONFIRMING_PHOTOS) & (inside >= MIN_INSIDE * framed))
+    return np.asarray((framed >= CONFIRMING_PHOTOS) & (framed - inside <= MAX_WRONG_SHARE * framed))
 
 
 def _cut_out(whole: Cloud, source: Path, workspace: Path, masks: Path) -> Cloud:

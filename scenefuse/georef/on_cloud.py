@@ -21,7 +21,7 @@ from scenefuse.core.stage import StageError, quantity, threads, value
 from scenefuse.core.transforms import Array, Sim3, box_corners, rotation_angle_deg
 from scenefuse.geometry.icp import refine_on_cloud
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
-from scenefuse.geometry.surface import ends_of
+from scenefuse.geometry.surface import SAMPLED_POINTS, ends_of
 from scenefuse.georef.placement import middle_of
 from scenefuse.georef.residuals import Georeference
 from scenefuse.photos.geodesy import LocalFrame
@@ -29,8 +29,8 @@ from scenefuse.photos.workspace import View, posed_images, view_of
 
 # ICP goes on until a round of steps moves no point by more than this share of the model's extent.
 MAX_STEP = 1e-3
-# Points of a cloud that a model is compared with or laid on, and that are projected into all photos.
-MAX_COMPARED, MAX_PROJECTED = 200_000, 10_000
+# Points of a cloud that a model is compared with or laid on.
+MAX_COMPARED = 200_000
 # A cloud in other coordinates than the cameras has a smaller share of its points in their pictures than the first, or
 # is met by a smaller share of the points that the photos' own matches give in its box than the second. Of four right
 # clouds 66 % were met or more; with mirrored or swapped axes, half a turn, or 5 % larger, 17 % or fewer.
@@ -73,7 +73,7 @@ def fit_to_cameras(points: Array, model: pycolmap.Reconstruction) -> dict[str, A
     """
     views = [view_of(model, image) for image in posed_images(model)]
     own = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    seen, centres = _seen(points[:: max(1, len(points) // MAX_PROJECTED)], views), np.array([v.centre for v in views])
+    seen, centres = _seen(points[:: max(1, len(points) // SAMPLED_POINTS)], views), np.array([v.centre for v in views])
     points = points[:: max(1, len(points) // MAX_COMPARED)]
     own = _in_box_of(points, own)
     met = _met(points, own, centres)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, setting
 from scenefuse.core.transforms import (
+    FIXING_POINTS,
     MAX_DEVIATIONS,
     SD_OVER_MEDIAN,
     UP,
@@ -16,16 +17,15 @@ from scenefuse.core.transforms import (
     fit_sim3_robust,
     rotation_between,
 )
-from scenefuse.georef.control import MIN_CONTROL_POINTS, LocatedPoint, check_spread, describe_misses
+from scenefuse.georef.control import LocatedPoint, check_spread, describe_misses
 from scenefuse.photos.geodesy import MAX_MEDIAN_DISTANCES
 from scenefuse.sfm.gravity import MAX_VERTICAL_SD_DEG
 
 Array = NDArray[np.float64]
 
-# Fewer registered photos with GPS do not show which of them is an outlier.
-MIN_GPS_PHOTOS = 5
-# Heights of GPS have twice the error of the plane. Errors drift slowly: so many photos beside each other have one.
-HEIGHT_ERROR, PHOTOS_OF_ONE_ERROR = 2.0, 5.0
+# Heights of GPS have twice the error of the plane. Errors drift slowly: so many photos beside each other have one, and
+# no fewer place a model.
+HEIGHT_ERROR, PHOTOS_OF_ONE_ERROR = 2.0, 5
 # How far a model may be bent, as a share of its extent: away from exact positions before it is adjusted to them, and
 # an object's before its pose is of no use.
 MAX_BENT = 0.1
@@ -120,7 +120,7 @@ def place_by_control(
         fitted, inliers = fit_measured(start, there, limit, seed)
     except ValueError:
         inliers = np.zeros(len(rows), dtype=bool)
-    if inliers.sum() < max(MIN_CONTROL_POINTS, len(rows) // 2 + 1):
+    if inliers.sum() < max(FIXING_POINTS, len(rows) // 2 + 1):
         raise StageError(
             f"{where}: only {inliers.sum()} of {len(rows)} control points agree with the model within {limit:.2g} m;"
             " check their coordinates, whether x is easting and y northing, and where each was clicked"
@@ -236,7 +236,7 @@ def place_by_gps(
         reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {accuracy_m:g} m"
         return upright(up, reason)
     fitted, inliers, levelled = _fit(centres, target, up, accuracy_m, limit, seed, sure_up)
-    if inliers.sum() < max(MIN_GPS_PHOTOS, 0.5 * len(target)):
+    if inliers.sum() < max(PHOTOS_OF_ONE_ERROR, 0.5 * len(target)):
         reason = f"only {inliers.sum()} of {len(target)} GPS positions agree with the cameras within {limit:g} m"
         return upright(up, reason)
     reason = f"{inliers.sum()} of {len(target)} photos by GPS"
@@ -258,7 +258,7 @@ def _fit(
     has_height = np.isfinite(target[:, 2])
 
     def fixes_tilt(rows: NDArray[np.bool_]) -> bool:
-        return bool(rows.sum() >= MIN_GPS_PHOTOS and _extent(target[rows])[1] >= MAX_DEVIATIONS * accuracy_m)
+        return bool(rows.sum() >= PHOTOS_OF_ONE_ERROR and _extent(target[rows])[1] >= MAX_DEVIATIONS * accuracy_m)
 
     def leans(fitted: Sim3, rows: NDArray[np.bool_]) -> bool:
         lean = np.degrees(np.arccos(np.clip(fitted.rotate(up)[2] / np.linalg.norm(up), -1, 1)))

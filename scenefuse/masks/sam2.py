@@ -20,8 +20,8 @@ from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCOD
 from scenefuse.masks.target import Target
 from scenefuse.photos.workspace import View
 
-# Sides of the square image that the network takes, and of the masks that it gives and takes.
-SIDE_PX, LOGITS_PX = 1024, 256
+# Side of the square image that the network takes; the masks that it gives and takes have a quarter of it.
+SIDE_PX = 1024
 # Known points that prompt a photo at most: far apart, they say as much as hundreds.
 MAX_POINTS_INSIDE, MAX_POINTS_OUTSIDE = 10, 6
 # Points in the middle of the object that prompt it as well, with the box around all: by points on all its ends and off
@@ -92,7 +92,7 @@ class Sam2Onnx:
         inputs = features | {
             "point_coords": points[None],
             "point_labels": labels[None],
-            "mask_input": np.zeros((1, 1, LOGITS_PX, LOGITS_PX), dtype=np.float32),
+            "mask_input": np.zeros((1, 1, SIDE_PX // 4, SIDE_PX // 4), dtype=np.float32),
             "has_mask_input": np.zeros(1, dtype=np.float32),
         }
         wanted = {i.name for i in self._decoder.get_inputs()}

@@ -18,7 +18,7 @@ from scenefuse.marks.triangulation import marked_size, triangulate_consistent
 from scenefuse.masks.grabcut import along_edges, cleaned, first_cuts, query_grabcut, second_cuts
 from scenefuse.masks.prompts import BOX_GROWTH_SHARE, Measure, Segmenter, agreement
 from scenefuse.masks.propagation import propagate
-from scenefuse.masks.sam2 import LOGITS_PX, SIDE_PX, Sam2, query_sam2, segment
+from scenefuse.masks.sam2 import SIDE_PX, Sam2, query_sam2, segment
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.masks.stereo_points import with_stereo_points
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
@@ -129,7 +129,7 @@ def _at_full_size(view: View, mask: Mask) -> Mask:
     """A mask (H, W) at its photo's resolution. Small parts of it stay: they were asked for, by a click or by points of
     other photos; small parts that the edges leave do not."""
     assert view.pixels is not None
-    edges = along_edges(view.pixels, mask, max(view.width, view.height) / LOGITS_PX, SIDE_PX)
+    edges = along_edges(view.pixels, mask, 4 * max(view.width, view.height) / SIDE_PX, SIDE_PX)
     asked = mask & ~cleaned(mask)
     return np.asarray(cleaned(edges, view.pixels) | (edges & asked))
 

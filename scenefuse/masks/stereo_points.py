@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import back_project
+from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS, select_views
 from scenefuse.photos.workspace import Rows, View, Workspace
@@ -16,8 +17,6 @@ from scenefuse.photos.workspace import Rows, View, Workspace
 SETTINGS = DepthMapSettings(max_image_size_px=200, sources=4, planes=64, window_px=5, min_score=0.6)
 # Photos of that size get a point in each square of so many pixels in which they see none.
 CELL_PX = 3
-# Relative difference of depths that agree.
-MAX_DEPTH_DIFFERENCE = 0.01
 
 DepthMap = NDArray[np.float32]
 
@@ -81,4 +80,4 @@ def _shown(view: View, depth: DepthMap, points: Array) -> Rows:
     """Rows (K,) of points (N, 3) that lie on a depth map (H, W)."""
     rows, pixels, away = view.visible(points)
     there = depth[pixels[:, 1], pixels[:, 0]]
-    return rows[np.abs(away - there) <= MAX_DEPTH_DIFFERENCE * there]
+    return rows[np.abs(away - there) <= DenseCloudSettings.max_depth_error * there]

@@ -8,12 +8,10 @@ import pycolmap
 from scenefuse.core.stage import StageError
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.photos.photo_files import masks_by_name, pictures_below
+from scenefuse.photos.photos import SHAPE_TOLERANCE
 from scenefuse.photos.pictures import matte_of, read_raw
 from scenefuse.photos.workspace import View, read_cameras
 from scenefuse.sfm.undistort import undistort_picture
-
-# Relative difference of a mask's proportions from its photo's beyond which it belongs to another picture.
-MAX_STRETCH = 0.02
 
 
 def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[str, Mask], dict[str, str]]:
@@ -64,7 +62,7 @@ def _read(file: Path, camera: pycolmap.Camera) -> Mask:
     except StageError:
         raise StageError(f"the supplied mask {file} cannot be read; export it again as PNG") from None
     height, width = mask.shape
-    if abs(width * camera.height / (height * camera.width) - 1) > MAX_STRETCH:
+    if abs(width * camera.height / (height * camera.width) - 1) > SHAPE_TOLERANCE:
         raise StageError(
             f"the supplied mask {file} is {width} x {height} pixels, its photo {camera.width} x {camera.height}; export"
             " it at the photo's size"

@@ -11,22 +11,16 @@ from scenefuse.cloud.cloud_file import STRAY_PERCENT
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.ground import Ground, fit_ground
-from scenefuse.geometry.visual_hull import NO_POINTS, Box
+from scenefuse.geometry.surface import SCORE_FRACTION
+from scenefuse.geometry.visual_hull import MAX_BEYOND_POINTS, MIN_OWN_POINTS, NO_POINTS, Box
 from scenefuse.masks.prompts import far_apart
 from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.photos.workspace import View, Workspace
 
-# Growth of the box of the object's points on each side, as a share of its diagonal: they seldom mark its ends. Prompts
-# no farther apart enclose a part: close clicks mark the corners of a small one.
-BOX_MARGIN_SHARE = 0.15
 # Sparse points, far apart, that stand for the object where masks voted for thousands.
 SPANNING_POINTS = 64
 # Ground is looked for so far beside the box, in half widths of it: farther off it may be another level.
 GROUND_REACH_HALF_WIDTHS = 1.5
-# How far a ground point may lie off the fitted surface, as a share of the box's diagonal: grass, gravel, errors of SfM.
-GROUND_SCATTER_SHARE = 0.02
-# Sparse points on the object that masks have to hold: fewer do not show its extent.
-MIN_OBJECT_POINTS = 10
 
 
 @dataclass(frozen=True)
@@ -77,19 +71,19 @@ def target_from_points(points: Array, photos: Workspace, up: Array, seed: int) -
         up: (3,) the direction against gravity.
         seed: seed of the ground's RANSAC.
     """
-    sparse, box = photos.points, upright_box(points, up, BOX_MARGIN_SHARE)
+    sparse, box = photos.points, upright_box(points, up, MAX_BEYOND_POINTS)
     x_in_box = box.to_box(sparse)
     ground, found = find_ground(x_in_box, box, box.to_box(points), seed)
     height = ground.height_of(x_in_box)
-    above = GROUND_SCATTER_SHARE * box.diagonal
-    grow = BOX_MARGIN_SHARE * float(np.linalg.norm(np.ptp(points, axis=0)))
+    above = SCORE_FRACTION * box.diagonal
+    grow = MAX_BEYOND_POINTS * float(np.linalg.norm(np.ptp(points, axis=0)))
     kind = np.zeros(len(sparse), dtype=np.int8)
     kind[~in_hull(sparse, span(points, grow))] = -1
     if found:
         kind[height < 0.5 * above] = -1
     kind[in_hull(sparse, span(points, 0.25 * grow)) & (height > above)] = 1
     kind[np.bincount(np.concatenate(photos.seen), minlength=len(sparse)) < CONFIRMING_PHOTOS] = 0
-    return Target(box, ground, found, points, grow, _parts(points, BOX_MARGIN_SHARE * box.diagonal), sparse, kind)
+    return Target(box, ground, found, points, grow, _parts(points, MAX_BEYOND_POINTS * box.diagonal), sparse, kind)
 
 
 def target_from_votes(
@@ -107,10 +101,10 @@ def target_from_votes(
         StageError: fewer than ten points are on the object.
     """
     own = photos.points[kind > 0]
-    if len(own) < MIN_OBJECT_POINTS:
+    if len(own) < MIN_OWN_POINTS:
         raise StageError(
             f"only {len(own)} points of the sparse model lie in the masks that the clicks lead to,"
-            f" {MIN_OBJECT_POINTS} are needed; click in a photo that shows more of the object, or in several. If it has"
+            f" {MIN_OWN_POINTS} are needed; click in a photo that shows more of the object, or in several. If it has"
             " no texture, there are none: light from the side may bring some out"
         )
     target = target_from_points(without_outermost(own), photos, up, seed)
@@ -177,7 +171,7 @@ def find_ground(points_in_box: Array, box: Box, prompts_in_box: Array, seed: int
     """
     ring = GROUND_REACH_HALF_WIDTHS * float((box.high - box.low)[:2].max()) / 2
     low_enough = points_in_box[points_in_box[:, 2] < box.high[2]]
-    ground = fit_ground(low_enough, box.low, box.high, ring, GROUND_SCATTER_SHARE * box.diagonal, seed)
+    ground = fit_ground(low_enough, box.low, box.high, ring, SCORE_FRACTION * box.diagonal, seed)
     if ground is None:
         return Ground(np.array([box.low[2], 0, 0, 0, 0, 0]), (box.low + box.high)[:2] / 2), False
     ground.coefficients[0] += min(0.0, float(ground.height_of(prompts_in_box).min()))

@@ -9,10 +9,10 @@ from scipy.spatial import QhullError
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.visual_hull import Mask
+from scenefuse.geometry.visual_hull import MIN_OWN_POINTS, Mask
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.prompts import POINT_RADIUS_SHARE, Measure, Prompts, distance_to, pixel_of
-from scenefuse.masks.target import MIN_OBJECT_POINTS, in_hull, without_outermost
+from scenefuse.masks.target import in_hull, without_outermost
 from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS, MIN_AGREEMENT
 from scenefuse.photos.workspace import Workspace
 
@@ -101,7 +101,7 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> NDArray[np.int8]:
     rows = [voter.rows for voter in made.values() if voter.can_vote]
     counts = np.bincount(np.concatenate([np.zeros(0, np.int64), *rows]), minlength=len(known))
     own = without_outermost(photos.points[(known > 0) & (counts >= CONFIRMING_PHOTOS)])
-    if len(own) >= MIN_OBJECT_POINTS:
+    if len(own) >= MIN_OWN_POINTS:
         with suppress(QhullError):  # of points in a plane, which enclose nothing
             known[(known < 0) & in_hull(photos.points, own)] = 0
     by_stereo = np.arange(len(known)) >= len(known) - photos.by_stereo
@@ -140,7 +140,7 @@ def points_in_masks(photos: Workspace, masks: list[Mask]) -> Array:
         np.add.at(seen, rows, 1)
         np.add.at(hit, rows, mask[v, u])
     own = photos.points[(seen >= 2) & (hit > MIN_AGREEMENT * seen)]
-    if len(own) < MIN_OBJECT_POINTS:
+    if len(own) < MIN_OWN_POINTS:
         raise StageError(
             f"only {len(own)} sparse points lie in the supplied masks; "
             "are they white on the object, and of these photos?"

@@ -7,16 +7,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scenefuse.geometry.consistency import back_project
+from scenefuse.geometry.consistency import DEPTH_JUMP, back_project
 from scenefuse.geometry.matcher import Matcher
 from scenefuse.mvs.plane_sweep import DepthMapSettings, refine_by_matching
 from scenefuse.mvs.sparse_depths import pair_worth
 from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import View
 
-# Places of a photo's depth map that other photos are chosen by; behind another's surface by this share of its depth, a
-# place is hidden there.
-PLACES, HIDDEN_SHARE = 200, 0.05
+# Places of a photo's depth map that other photos are chosen by.
+PLACES = 200
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ def choose_sources(views: Views, depths: NDArray[np.float32]) -> NDArray[np.int6
     for index, depth in enumerate(depths):
         shown, pixels, away = views.view(index).visible(places.reshape(-1, 3))
         there = depth[pixels[:, 1], pixels[:, 0]]
-        shown = shown[(there == 0) | (away <= (1 + HIDDEN_SHARE) * there)]
+        shown = shown[(there == 0) | (away <= (1 + DEPTH_JUMP) * there)]
         for other in np.flatnonzero(np.arange(len(depths)) != index):
             both = places[other, shown[shown // PLACES == other] % PLACES]
             worth[other, index] = pair_worth(both, centres[other], centres[index])[0]

@@ -10,6 +10,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
+from scenefuse.geometry.consistency import DEPTH_JUMP
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import View, Workspace
@@ -26,8 +27,6 @@ MAX_TRIANGLE_SIDE = 0.06
 MASK_REACH_PX = 2
 # Share of the masks that must agree on a sparse point, of those in whose photos it is observed.
 MIN_AGREEMENT = 0.8
-# What hides a point of the object is this much nearer, as a share of its depth: between such points it may bulge.
-BULGE_SHARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ def _depths_of(views: Views, index: int, own: NDArray[np.bool_]) -> NDArray[np.f
     of_object = _interpolated(exact[on], 1 / depth[on], mask.shape)
     beside = _interpolated(
         np.concatenate([exact[off], there[hidden]]),
-        1 / np.concatenate([depth[off], (1 - BULGE_SHARE) * behind[hidden]]),
+        1 / np.concatenate([depth[off], (1 - DEPTH_JUMP) * behind[hidden]]),
         mask.shape,
     )
     nearness = np.where(mask, of_object, beside)

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, write_cloud
+from scenefuse.cloud.import_cloud import MIN_POINTS
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, write_json
 from scenefuse.geometry.consistency import compare, extent, surface_points
@@ -27,8 +28,6 @@ from scenefuse.photos.views import Views, load_views
 
 Maps = NDArray[np.float32]
 
-# Fewer points than these are no surface.
-MIN_POINTS = 100
 # Points belong to one group where steps of this many spacings lead from one to the other.
 MAX_STEP = 3
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from scenefuse.cloud.cloud_file import NEIGHBOURS
 from scenefuse.core.stage import StageError
 from scenefuse.geometry.surface import ends_of
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
@@ -30,9 +31,6 @@ MARGIN = 0.06
 STEREO = DepthMapSettings(sources=6, best_sources=2, window_px=5)
 # Matching score at which stereo and SfM points count the same.
 EVEN_SCORE = 0.3
-# SfM points that a pixel takes its disparity from, that a point is held against to find outliers, and that fix a map's
-# scale and shift.
-NEAREST_POINTS = 8
 Map = NDArray[np.float32]
 
 
@@ -257,11 +255,11 @@ def _between_points(photos: DepthPhotos, index: int) -> Tensor:
         points = np.array([[width / 2, height / 2, middle]], dtype=np.float32)
     disparity = disparity_from_depth(torch.from_numpy(points[:, 2]), photos.near, photos.far).numpy()
     tree = cKDTree(points[:, :2])
-    around = disparity[tree.query(points[:, :2], min(NEAREST_POINTS, len(points)))[1].reshape(len(points), -1)]
+    around = disparity[tree.query(points[:, :2], min(NEIGHBOURS, len(points)))[1].reshape(len(points), -1)]
     off = np.abs(disparity - np.median(around, axis=1))
     keep = off <= 4.0 * np.median(off) + 0.02
     rows, columns = np.indices((height, width)).reshape(2, -1) + 0.5
-    near_by = min(NEAREST_POINTS, int(keep.sum()))
+    near_by = min(NEIGHBOURS, int(keep.sum()))
     distance, neighbour = cKDTree(points[keep, :2]).query(np.column_stack([columns, rows]), near_by)
     distance, neighbour = distance.reshape(-1, near_by), neighbour.reshape(-1, near_by)
     weight = 1.0 / (distance**2 + 1.0)

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import Sim3
-from scenefuse.geometry.consistency import normals_from_depth
+from scenefuse.geometry.consistency import DEPTH_JUMP, normals_from_depth
 from scenefuse.geometry.photo_kernel import MIN_AGREEING
-from scenefuse.nerf.appearance import DEPTH_JUMP, MIN_OPACITY, falloff_map, fitted_log_gain, gains_nearby
+from scenefuse.nerf.appearance import MIN_OPACITY, falloff_map, fitted_log_gain, gains_nearby
 from scenefuse.nerf.rays import SURFACE_DEPTH, PhotoTensors, dilate
 from scenefuse.nerf.refine_depth import MAP_AGREEMENT, agreement
 from scenefuse.nerf.render import RenderedView, render_view

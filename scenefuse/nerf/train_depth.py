@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from scipy.stats import siegelslopes
 from torch import Tensor
 
+from scenefuse.cloud.cloud_file import NEIGHBOURS
 from scenefuse.core.checkpoints import key_of
 from scenefuse.core.stage import atomic_directory, quantity, setting, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.monodepth import DepthNetwork, depth_from_disparity, parameters, sample
 from scenefuse.nerf.prior_inputs import (
-    NEAREST_POINTS,
     STEREO,
     DepthPhotos,
     NetworkInputs,
@@ -163,7 +163,7 @@ def align_to_points(predicted: Array, measured: Array) -> tuple[float, float]:
         predicted: (N,) depths of the map at SfM points.
         measured: (N,) depths of those points.
     """
-    if len(predicted) < NEAREST_POINTS:
+    if len(predicted) < NEIGHBOURS:
         return 1.0, 0.0
 
     line = siegelslopes(measured, predicted)

@@ -19,7 +19,7 @@ from scenefuse.core.transforms import Sim3
 from scenefuse.mvs.sparse_depths import own_points, sparse_depths
 from scenefuse.nerf.appearance import measured_sharpness, photo_weights
 from scenefuse.nerf.field import FieldSettings, kernels_on
-from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.losses import SOLID_OPACITY, LossWeights
 from scenefuse.nerf.rays import PhotoTensors
 from scenefuse.nerf.refine_depth import DepthPrior, read_prior
 from scenefuse.nerf.rendered_maps import (
@@ -46,7 +46,7 @@ from scenefuse.nerf.volume import Volume, find_volume, hidden_pixels, silhouette
 from scenefuse.photos.views import Views, load_views
 
 # A rendered depth is confident from here on; what later stages and the export call confident.
-MIN_CONFIDENCE = 0.5
+MIN_CONFIDENCE = SOLID_OPACITY
 # What a training returns beside its losses.
 NO_LOSSES = ("steps", "seconds", "rays_per_second", "samples_per_second", "psnr")
 

@@ -12,8 +12,8 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.geometry.surface import ends_of
 from scenefuse.geometry.visual_hull import (
+    MIN_FRAMING_SHARE,
     MIN_OWN_POINTS,
-    MIN_WHOLE_SHARE,
     NO_POINTS,
     Outline,
     count_silhouettes,
@@ -27,8 +27,6 @@ from scenefuse.photos.workspace import View
 FIRST_CELLS = 64
 # Share of the cube's side left free on each side of the hull, for what the masks cut off.
 MARGIN = 0.02
-# Share of the photos that must frame a cell, more than masks need: what few photos bound is large, and costs rays.
-MIN_FRAMING_SHARE = 0.3
 # The first, rough cube is wider by this share on each side than the masks' extents ask for, or the object's own points.
 ROUGH_MARGIN = 0.25
 
@@ -120,9 +118,9 @@ def _hides(outline: Outline, centres: Array, reach: float) -> NDArray[np.bool_]:
 
 
 def _rough_cube(views: list[View], own: Array) -> Sim3:
-    """By the cameras where a third of the photos have the object whole; else around its own points, if there are some:
+    """By the cameras where a quarter of the photos have the object whole; else around its own points, if it has some:
     what masks show of a facade has neither its middle nor its extent."""
-    if len(own) < MIN_OWN_POINTS or sum(is_whole(view.pixels) for view in views) >= MIN_WHOLE_SHARE * len(views):
+    if len(own) < MIN_OWN_POINTS or sum(is_whole(view.pixels) for view in views) >= MIN_FRAMING_SHARE * len(views):
         return cube_from_cameras(views)
     low, high = ends_of(own)
     side = float((high - low).max() + 2 * ROUGH_MARGIN * np.linalg.norm(high - low))
@@ -191,7 +189,7 @@ def visual_hull(
     """
     object_from_unit = unit_from_object.inverse()
     count = size // 4
-    quorum = least_framing([outline.view for outline in outlines], own, MIN_FRAMING_SHARE)
+    quorum = least_framing([outline.view for outline in outlines], own)
     cells, children = _corners(count), _corners(2)
     while True:
         points = object_from_unit.apply((cells + 0.5) / count)

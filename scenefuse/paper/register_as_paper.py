@@ -28,6 +28,7 @@ from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import quantity, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.geometry.icp import ScaleRange, triples_of_one_scale
+from scenefuse.geometry.surface import SCORE_FRACTION
 from scenefuse.register.agreement import draw_alignment
 from scenefuse.register.coarse import coarse_quantities
 from scenefuse.register.decision import FineSettings, tilt_deg
@@ -42,7 +43,7 @@ from scenefuse.register.problem import (
     rms,
     scale_quantities,
 )
-from scenefuse.register.score import SCORE_FRACTION, Hypothesis, score
+from scenefuse.register.score import Hypothesis, score
 from scenefuse.register.uncertainty import uncertainty_quantities
 
 # The paper's: the voxel as a share of the diagonal.

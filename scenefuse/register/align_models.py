@@ -30,8 +30,9 @@ from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities
 RANSAC_SAMPLES = 100_000
 # Largest reprojection error of an inlier, RMS, in pixels of the coarser photos.
 MAX_ERROR_PX = 6.0
-# The gate: inliers of the best pose among the other matches, over inliers; standard deviations of scale and rotation.
-MAX_RIVAL_SHARE, MAX_SCALE_SD_LOG, MAX_ROTATION_SD_DEG = 0.5, 0.05, 3.0
+# The gate: inliers of the best pose among the other matches, over inliers; standard deviation of the log scale, and of
+# the rotation in radians: how far either moves what is a unit off the middle.
+MAX_RIVAL_SHARE, MAX_SD = 0.5, 0.05
 # Draws of photos and points for the standard deviations.
 BOOTSTRAP_DRAWS = 200
 
@@ -223,17 +224,11 @@ def rejection_reason(
             f"another pose has {consensus.rival} points of its own beside the best one's {count}: something is there"
             " twice"
         )
-    scale, turn = uncertainty.scale_sd_log, uncertainty.rotation_sd_deg
-    if scale > MAX_SCALE_SD_LOG:
-        return (
-            f"the {count} shared points leave the scale open by {100 * scale:.1f} %, more than"
-            f" {100 * MAX_SCALE_SD_LOG:.1f} %"
-        )
-    if turn > MAX_ROTATION_SD_DEG:
-        return (
-            f"the {count} shared points leave the rotation open by {turn:.1f} degrees, more than"
-            f" {MAX_ROTATION_SD_DEG:.1f}"
-        )
+    scale, turn, most_deg = uncertainty.scale_sd_log, uncertainty.rotation_sd_deg, np.degrees(MAX_SD)
+    if scale > MAX_SD:
+        return f"the {count} shared points leave the scale open by {100 * scale:.1f} %, more than {100 * MAX_SD:.1f} %"
+    if turn > most_deg:
+        return f"the {count} shared points leave the rotation open by {turn:.1f} degrees, more than {most_deg:.1f}"
     return None
 
 

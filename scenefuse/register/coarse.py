@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.stage import quantity, threads, write_json
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.geometry.icp import MAX_TRIPLES, RANSAC_POSES, ScaleRange, refine_points, triples_of_one_scale
-from scenefuse.geometry.surface import Surface, prepare, with_grid, with_queries
+from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare, with_grid, with_queries
 from scenefuse.register.problem import (
     SURFACE_POINTS,
     Constraints,
@@ -26,7 +26,7 @@ from scenefuse.register.problem import (
     prior,
     scale_quantities,
 )
-from scenefuse.register.score import RECALL_WEIGHT, SCORE_FRACTION, Hypothesis, best_distinct, score
+from scenefuse.register.score import RECALL_WEIGHT, Hypothesis, best_distinct, score
 
 Candidate = tuple[Sim3, str]
 

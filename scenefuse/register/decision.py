@@ -9,14 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import setting
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
-from scenefuse.geometry.surface import Surface, ends_of
+from scenefuse.geometry.surface import SCORE_FRACTION, Surface, ends_of
 from scenefuse.georef.placement import MAX_BENT
 from scenefuse.register.problem import Problem
 from scenefuse.register.score import (
     DISTINCT_ANGLE_DEG,
     DISTINCT_SHIFT,
     MIN_MARGIN,
-    SCORE_FRACTION,
     Hypothesis,
     color_agreement,
     distinct,

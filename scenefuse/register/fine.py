@@ -12,12 +12,13 @@ from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.depth_test import FreeSpace, read_free_space
 from scenefuse.geometry.icp import ScaleRange
+from scenefuse.geometry.surface import SCORE_FRACTION
 from scenefuse.register.agreement import draw_alignment
 from scenefuse.register.coarse import Candidate
 from scenefuse.register.decision import DecidedBy, FineSettings, tilt_deg
 from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, read_alignment
 from scenefuse.register.refinement import Outcome, refine_hypotheses
-from scenefuse.register.score import SCORE_FRACTION, Hypothesis
+from scenefuse.register.score import Hypothesis
 from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities, with_bending
 
 # Photos whose depth maps give the free space; more look from sides that these have seen.

@@ -8,7 +8,7 @@ import numpy as np
 
 from scenefuse.core.stage import quantity, read_json, value
 from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3
-from scenefuse.georef.placement import MIN_GPS_PHOTOS, PHOTOS_OF_ONE_ERROR, GeoreferenceSettings, place_by_gps
+from scenefuse.georef.placement import PHOTOS_OF_ONE_ERROR, GeoreferenceSettings, place_by_gps
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.photos import gps_accuracies, gps_positions, read_photos
 from scenefuse.register.landmarks import Landmarks
@@ -72,7 +72,7 @@ def pose_by_gps(
     names, positions = gps_positions(listed)
     row_of = {name: row for row, name in enumerate(obj.photos)}
     known = [k for k, name in enumerate(names) if name in row_of]
-    if not isinstance(frame, LocalFrame) or len(known) < MIN_GPS_PHOTOS:
+    if not isinstance(frame, LocalFrame) or len(known) < PHOTOS_OF_ONE_ERROR:
         return None
     rotations, centres = (part[[row_of[names[k]] for k in known]] for part in _cameras(obj))
     target, sd_m = frame.apply(positions[known]), float(np.median(gps_accuracies(listed, accuracy_m)[known, 0]))

@@ -10,8 +10,7 @@ from scenefuse.cloud.clouds import Cloud, voxel_downsample
 from scenefuse.core.transforms import UP, Array, rotation_between
 from scenefuse.crop.crop_cloud import CropSettings, crop_cloud
 from scenefuse.crop.crop_scene import MIN_POINTS
-from scenefuse.geometry.surface import Surface, prepare
-from scenefuse.register.score import SCORE_FRACTION
+from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare
 
 Rows = NDArray[np.int64]
 

@@ -12,13 +12,10 @@ from scenefuse.core.stage import StageError, quantity, read_json, value
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_angle_deg, rotation_between
 from scenefuse.geometry.depth_test import FreeSpace
 from scenefuse.geometry.icp import ScaleRange
-from scenefuse.geometry.surface import Surface, prepare
-from scenefuse.register.score import SCORE_FRACTION
+from scenefuse.geometry.surface import SCORE_FRACTION, Surface, along_a_line, prepare
 from scenefuse.register.uncertainty import Uncertainty
 from scenefuse.sfm.gravity import UNSURE_CUES
 
-# Points on a line leave the turn about it open: below this ratio of the two largest RMS extents no pose is sought.
-MIN_BREADTH = 1e-3
 # Points kept of either cloud. The polish queries a quarter of them; the search, in which poses differ grossly, keeps a
 # half and queries a tenth.
 SURFACE_POINTS = 12_000
@@ -137,9 +134,7 @@ class Problem:
 
 def check_extent(cloud: Cloud, name: str) -> None:
     """StageError where a cloud's points lie in one place or along one line: nothing fixes a pose of it then."""
-    centred = cloud.points - cloud.points.mean(0)
-    extents = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0))
-    if cloud.diagonal == 0 or extents[1] <= MIN_BREADTH * extents[2]:
+    if along_a_line(cloud.points):
         where = "in one place" if cloud.diagonal == 0 else "along one line"
         raise StageError(f"all {len(cloud)} points of {name} lie {where}: a registration needs a surface")
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.icp import refine_planes, refine_points
-from scenefuse.geometry.surface import Surface, prepare, with_grid, with_queries
+from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare, with_grid, with_queries
 from scenefuse.register.coarse import Candidate
 from scenefuse.register.decision import (
     MAX_FREE_SPACE_VIOLATION,
@@ -24,15 +24,7 @@ from scenefuse.register.decision import (
 from scenefuse.register.likelihood import certified
 from scenefuse.register.problem import SURFACE_POINTS, Problem
 from scenefuse.register.repetition import multiples, shifted, shifts_onto_itself, undecided_shift
-from scenefuse.register.score import (
-    DISTINCT_ANGLE_DEG,
-    DISTINCT_SHIFT,
-    SCORE_FRACTION,
-    Hypothesis,
-    Score,
-    best_distinct,
-    score,
-)
+from scenefuse.register.score import DISTINCT_ANGLE_DEG, DISTINCT_SHIFT, Hypothesis, Score, best_distinct, score
 from scenefuse.register.uncertainty import Uncertainty, common_error, with_bending
 
 # First pairing distance, as a share of the diagonal: of poses that differ by less, one finds the other.

@@ -18,6 +18,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, threads
+from scenefuse.core.transforms import FIXING_POINTS
 
 # He et al. 2026: iterations of a global bundle adjustment, and of the linear solver within one.
 ITERATIONS, LINEAR_SOLVER_ITERATIONS = 100, 200
@@ -26,7 +27,7 @@ ROUGH_TOLERANCE = 1e-7
 # Observations with a larger error are dropped, as COLMAP's mapper does.
 MAX_REPROJECTION_ERROR_PX = pycolmap.IncrementalMapperOptions().filter_max_reproj_error
 # The smallest model that has a shape.
-MIN_PHOTOS = 3
+MIN_PHOTOS = FIXING_POINTS
 # Reprojection error at which an observation loses half its weight (Cauchy; Triggs et al. 1999).
 ROBUST_PX = 1.0
 # Matches that chance hardly gives a pair: as many as COLMAP needs to place a photo. Between leaves, guided matching

@@ -11,10 +11,7 @@ import pycolmap
 from scenefuse.core.stage import StageError, scratch_directory
 from scenefuse.photos.cameras.given import PosedPhoto, at_size, possible_turns
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
-from scenefuse.sfm.colmap import cancellable
-
-# Cameras that fit their photos give each photo so many points at least, in the median.
-MIN_POINTS = 20
+from scenefuse.sfm.colmap import STRONG_PAIR, cancellable
 
 
 def triangulated(
@@ -53,10 +50,10 @@ def triangulated(
     best = int(np.argmax(met))
     found, turned = models[best], sum(ways[best][name] is not posed[name] for name in posed)
     points = [found.images[i].num_points3D for i in found.reg_image_ids()]
-    if not points or np.median(points) < MIN_POINTS:
+    if not points or np.median(points) < STRONG_PAIR:
         raise StageError(
-            f"{cameras}: its cameras do not fit the photos: half of them see fewer than {MIN_POINTS} points where their"
-            " matches meet; give cameras of these photos, as large as they were computed for or scaled down alike"
+            f"{cameras}: its cameras do not fit the photos: half of them see fewer than {STRONG_PAIR} points where"
+            " their matches meet; give cameras of these photos, as large as they were computed for or scaled down alike"
         )
     if len(ways) > 1:
         notes.append(

@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
-from scenefuse.fuse.compare import MARGIN, SAME_PLACE_SPACINGS, THROUGH_PHOTOS
-from scenefuse.fuse.measure import MIN_NEIGHBOURS, SUPPORT, Evidence, with_normals
+from scenefuse.fuse.compare import MARGIN, MIN_AGREEING, SAME_PLACE_SPACINGS
+from scenefuse.fuse.measure import NEIGHBOURS, SUPPORT, Evidence, with_normals
 from scenefuse.geometry.photo_kernel import MIN_COSINE
 from scenefuse.photos.workspace import View
 
@@ -88,10 +88,8 @@ def make_mesh(cloud: Cloud, views: list[View]) -> Surface:
     """
     notes = []
     step, count = spacing(cloud.points), len(cloud)
-    if count <= MIN_NEIGHBOURS or step == 0 or np.linalg.matrix_rank(cloud.points - cloud.points.mean(0), step) < 2:
-        raise StageError(
-            f"{count} points have no surface; at least {MIN_NEIGHBOURS + 1} that lie in no line are needed"
-        )
+    if count <= NEIGHBOURS or step == 0 or np.linalg.matrix_rank(cloud.points - cloud.points.mean(0), step) < 2:
+        raise StageError(f"{count} points have no surface; at least {NEIGHBOURS + 1} that lie in no line are needed")
     while len(cloud) > MAX_POINTS:
         step *= max(1.1, np.sqrt(len(cloud) / MAX_POINTS))
         cloud = voxel_downsample(cloud, step)
@@ -139,7 +137,7 @@ def oriented(cloud: Cloud, views: list[View]) -> Cloud:
         behind = (towards * cloud.normals).sum(1) < 0
         return replace(cloud, normals=np.where(behind[:, None], -cloud.normals, cloud.normals))
     points = _open3d_cloud(cloud, cloud.points.mean(0))
-    points.orient_normals_consistent_tangent_plane(MIN_NEIGHBOURS)
+    points.orient_normals_consistent_tangent_plane(NEIGHBOURS)
     return replace(cloud, normals=np.asarray(points.normals).astype(np.float32))
 
 
@@ -172,7 +170,7 @@ def _poisson(cloud: Cloud, step: float) -> tuple[Array, Rows, NDArray[np.float32
 
 def _reach(cloud: Cloud, tree: cKDTree) -> Array:
     """(N,) how far from each point a face is still beside it: some of the local spacings, or a standard deviation."""
-    count = min(MIN_NEIGHBOURS + 1, len(cloud))
+    count = min(NEIGHBOURS + 1, len(cloud))
     distance, near = tree.query(cloud.points, k=count, workers=threads())
     local = np.median(distance[:, 1][near], axis=1)
     deviation = cloud.fields.get("deviation", np.zeros(len(cloud)))
@@ -262,7 +260,7 @@ def _seen_through(corners: Array, scene, views: list[View], margin: float) -> Ma
         front = (hit["primitive_normals"] * rays).sum(1) < 0
         front &= np.abs((normals[rows] * rays).sum(1)) >= MIN_COSINE * length
         count[rows] += front & np.isfinite(hit["t_hit"]) & ((hit["t_hit"] - 1) * length > margin)
-    return count >= THROUGH_PHOTOS
+    return count >= MIN_AGREEING
 
 
 def _neighbours(faces: Rows) -> tuple[Rows, Mask]:

@@ -35,15 +35,15 @@ def constant(value: Any) -> Any:
 COMPARE, MEASURE, SETTLE = (f"scenefuse.fuse.{name}" for name in ("compare", "measure", "settle"))
 CHECK, KERNEL = "scenefuse.geometry.photo_check", "scenefuse.geometry.photo_kernel"
 RULES = [
-    Rule("what photos see through goes", f"{COMPARE}.THROUGH_PHOTOS", constant(10**9)),
-    Rule("two photos see through, not one", f"{COMPARE}.THROUGH_PHOTOS", constant(1)),
+    Rule("what photos see through goes", f"{COMPARE}.MIN_AGREEING", constant(10**9)),
+    Rule("two photos see through, not one", f"{COMPARE}.MIN_AGREEING", constant(1)),
     Rule("a share of the photos sees through", f"{COMPARE}.THROUGH_SHARE", constant(0.0)),
     Rule("that share halved", f"{COMPARE}.THROUGH_SHARE", lambda share: share / 2),
     Rule("that share doubled", f"{COMPARE}.THROUGH_SHARE", lambda share: 2 * share),
     Rule("margin halved", f"{COMPARE}.MARGIN", lambda margin: margin / 2),
     Rule("margin doubled", f"{COMPARE}.MARGIN", lambda margin: 2 * margin),
-    Rule("same place: deviations halved", f"{COMPARE}.SAME_PLACE_DEVIATIONS", lambda number: number / 2),
-    Rule("same place: deviations doubled", f"{COMPARE}.SAME_PLACE_DEVIATIONS", lambda number: 2 * number),
+    Rule("same place: deviations halved", f"{COMPARE}.MAX_DEVIATIONS", lambda number: number / 2),
+    Rule("same place: deviations doubled", f"{COMPARE}.MAX_DEVIATIONS", lambda number: 2 * number),
     Rule("the better side by a factor", f"{COMPARE}.BETTER_FACTOR", constant(1.0)),
     Rule("that factor doubled", f"{COMPARE}.BETTER_FACTOR", lambda factor: 2 * factor),
     Rule("roughness adds to the deviation", f"{COMPARE}._rougher", lambda f: lambda a, b, side: (0.0, 0.0)),

@@ -143,7 +143,7 @@ def _mask_as_it_is(position: int) -> Any:
 M = "scenefuse.masks"
 RULES = [
     Rule("no votes next to the outline", f"{M}.votes.POINT_RADIUS_SHARE", lambda _: 0.0),
-    Rule("enclosed points are unknown", f"{M}.votes.MIN_OBJECT_POINTS", _never),
+    Rule("enclosed points are unknown", f"{M}.votes.MIN_OWN_POINTS", _never),
     Rule("a click outside counts in all photos", f"{M}.votes._denied", lambda _: lambda *__: []),
     Rule("points by stereo", f"{M}.segmentation.with_stereo_points", lambda _: lambda photos: photos),
     Rule("four prompts in the middle", f"{M}.sam2.MIDDLE_POINTS", lambda _: 1),
