@@ -14,8 +14,7 @@ from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import UP, Array, Sim3
 from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole, without_strays
-from scenefuse.crop.one_photo import MAX_GROWTH, SceneClicks, crop_grown, locate_clicks
-from scenefuse.crop.vote import read_masked_views, vote
+from scenefuse.crop.marked import MAX_GROWTH, SceneClicks, crop_grown, locate_clicks, read_masked_views, vote
 from scenefuse.geometry.surface import SAMPLED_POINTS
 from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
 from scenefuse.marks.triangulation import locate

@@ -17,9 +17,8 @@ from scenefuse.core.stage import atomic_file, quantity, read_json, threads, valu
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.fuse.fuse_object import photos_of
 from scenefuse.fuse.measure import RESOLUTION, with_normals
-from scenefuse.fuse.missing import Lack, Missing, find_missing_surface
+from scenefuse.fuse.missing import NEAR, Lack, Missing, Plan, find_missing_surface, plan_stations, reach_of_stations
 from scenefuse.fuse.modes import around
-from scenefuse.fuse.next_photos import NEAR, Plan, plan_stations, reach_of_stations
 from scenefuse.fuse.write import added_by, read_changes, together
 from scenefuse.geometry.photo_check import Photos
 from scenefuse.photos.geodesy import GridFrame, LocalFrame, length_unit, scene_frame

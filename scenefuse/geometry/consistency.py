@@ -27,7 +27,6 @@ class DepthAgreement:
     Attributes:
         agree: (N,) views whose depth at the point is the point's own, within the tolerance.
         through: (N,) views that see past the point: it floats in front of their surface.
-        hidden: (N,) views for which the point is behind their surface.
         off_mask: (N,) views in whose picture the point lies off the mask, with nothing before it.
         mean: (N, 3) mean of the point and the points that agree with it.
         compared: number of other views.
@@ -35,7 +34,6 @@ class DepthAgreement:
 
     agree: NDArray[np.int32]
     through: NDArray[np.int32]
-    hidden: NDArray[np.int32]
     off_mask: NDArray[np.int32]
     mean: Array
     compared: int
@@ -111,17 +109,17 @@ def compare(
         covered: (V, H, W) depth along z from which on a view sees nothing off its mask, where it is known.
     """
     compared = others(view, frame_from_cam)
-    counts, total = np.zeros((4, len(points)), np.int32), points.astype(np.float64)
+    counts, total = np.zeros((3, len(points)), np.int32), points.astype(np.float64)
     known = np.zeros((0, 0, 0), np.float32) if covered is None else covered
     cameras = intrinsics.astype(np.float64), frame_from_cam.astype(np.float64)
     _compare(points.astype(np.float64), compared, depths, masks, known, *cameras, tolerance, counts, total)
-    agree, through, hidden, off_mask = counts
-    return DepthAgreement(agree, through, hidden, off_mask, total / (agree + 1)[:, None], len(compared))
+    agree, through, off_mask = counts
+    return DepthAgreement(agree, through, off_mask, total / (agree + 1)[:, None], len(compared))
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _compare(points, compared, depths, masks, covered, intrinsics, frame_from_cam, tolerance, counts, total):  # type: ignore[no-untyped-def]
-    """Add to counts (4, N) of `DepthAgreement` and to the sum (N, 3) of the points that agree.
+    """Add to counts (3, N) of `DepthAgreement` and to the sum (N, 3) of the points that agree.
 
     A thread takes neighbouring points through one map after the other: what they look up stays in its cache.
     """
@@ -142,13 +140,11 @@ def _compare(points, compared, depths, masks, covered, intrinsics, frame_from_ca
                     continue
                 row, column = int(v), int(u)
                 if not masks[other, row, column] and (len(covered) == 0 or z < covered[other, row, column]):
-                    counts[3, n] += 1
+                    counts[2, n] += 1
                 measured = depths[other, row, column]
                 found = place(z, measured, measured, tolerance)
                 if found == Where.IN_FRONT:
                     counts[1, n] += 1
-                elif found == Where.BEHIND:
-                    counts[2, n] += 1
                 elif found == Where.AT:
                     counts[0, n] += 1
                     # The other view's depth, taken along the ray through the point itself, not the pixel's centre.

@@ -1,6 +1,7 @@
 """A cloud made ready for matching, thinned, with normals and smoothed colours; nearest neighbours of two of them."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,6 @@ NORMAL_NEIGHBOURS = 16
 # Distance within which points of two surfaces agree, as a share of a diagonal; points within twice that, of which
 # either is off by it at most, belong together.
 SCORE_FRACTION = 0.02
-# Noise of colours, 0..1: those that vary less say nothing, nor do those nearer to black or clipped white.
-COLOR_NOISE = 0.03
 # Points lie along a line where they extend across it by less than this share of their extent along it (RMS).
 MIN_BREADTH = 0.01
 # Points that stand for a cloud where all would take long.
@@ -168,7 +167,7 @@ def along_a_line(points: Array) -> bool:
     return bool(least <= MIN_BREADTH * most)
 
 
-def ends_of(places: Array) -> Array:
+def ends_of(places: NDArray[np.floating[Any]]) -> Array:
     """(2, ...) where points end, by their places (N, ...) along directions; strays do not count."""
     return np.percentile(places, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
 

@@ -1,5 +1,7 @@
-"""Masks of the object in every photo: by GrabCut or SAM 2 from prompts, or supplied; checked by their visual hull."""
+"""Masks of the object in every photo: by GrabCut or SAM 2 from prompts, or those that a person supplies for the
+original photos, moved into the undistorted ones; what of them `keep` keeps; all checked by their visual hull."""
 
+import ast
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -24,17 +27,18 @@ from scenefuse.core.stage import (
 )
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.clicks import read_points
-from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.prompts import overlap
 from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.sam2_weights import why_unavailable
 from scenefuse.masks.segmentation import MaskSettings, Prompted, ScoredMasks, masks_from_prompts, score_masks
-from scenefuse.masks.supplied import supplied_masks
 from scenefuse.masks.target import target_from_points
 from scenefuse.masks.votes import points_in_masks
 from scenefuse.photos.frames import original_sizes
-from scenefuse.photos.pictures import write_picture
-from scenefuse.photos.workspace import View, Workspace, read_workspace
+from scenefuse.photos.photo_files import masks_by_name, pictures_below
+from scenefuse.photos.photos import SHAPE_TOLERANCE
+from scenefuse.photos.pictures import matte_of, read_raw, write_picture
+from scenefuse.photos.workspace import View, Workspace, read_cameras, read_workspace
+from scenefuse.sfm.undistort import undistort_picture
 
 # Width of a photo on the contact sheet, and photos side by side.
 TILE_WIDTH_PX, TILE_COLUMNS = 240, 8
@@ -258,3 +262,113 @@ def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str], se
         "dropped": made.dropped,
         "per_photo": per_photo,
     }
+
+
+def mask_folders(keep: str) -> list[Path]:
+    """The folders of masks that an expression names.
+
+    Args:
+        keep: `object`, folders in quotes, `and`, `or`, `not` and brackets.
+
+    Raises:
+        StageError: anything else.
+    """
+    return [Path(str(node.value)) for node in ast.walk(_parsed(keep)) if isinstance(node, ast.Constant)]
+
+
+def kept_part(keep: str, own: Mask, others: dict[Path, Mask]) -> Mask:
+    """The expression's value in one photo.
+
+    Args:
+        keep: the expression.
+        own: (H, W) the mask of the object.
+        others: (H, W) of each folder; a photo without a mask shows nothing of that.
+    """
+
+    def value(node: ast.expr) -> Mask:
+        if isinstance(node, ast.BoolOp):
+            combine = np.logical_and if isinstance(node.op, ast.And) else np.logical_or
+            return combine.reduce([value(part) for part in node.values])
+        if isinstance(node, ast.UnaryOp):
+            return ~value(node.operand)
+        return others.get(Path(str(node.value)), np.zeros_like(own)) if isinstance(node, ast.Constant) else own
+
+    return value(_parsed(keep))
+
+
+def _parsed(keep: str) -> ast.expr:
+    def fits(node: ast.AST) -> bool:
+        if isinstance(node, ast.BoolOp):
+            return all(fits(part) for part in node.values)
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+            return fits(node.operand)
+        if isinstance(node, ast.Constant):
+            return isinstance(node.value, str)
+        return isinstance(node, ast.Name) and node.id == "object"
+
+    try:
+        expression = ast.parse(keep.strip(), mode="eval").body
+    except SyntaxError:
+        expression = None
+    if expression is None or not fits(expression):
+        raise StageError(
+            f"object.masks.keep cannot be read: {keep}; write object, folders of masks in quotes, and, or, not and "
+            "brackets, for instance: object and not 'data/house/sky'"
+        )
+    return expression
+
+
+def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[str, Mask], dict[str, str]]:
+    """Masks from a folder by the name of the photo they belong to, undistorted like it; and why others are unusable.
+
+    Args:
+        folder: pictures named like the photos, with or without `_mask`; non-zero on the object. A mask may be larger
+            or smaller than its photo.
+        sparse: COLMAP model of the original photos, before undistortion.
+        views: the undistorted photos.
+
+    Raises:
+        StageError: no such folder, masks that belong to none of the photos, or none that is usable.
+    """
+    if not folder.is_dir():
+        raise StageError(
+            f"the folder of masks {folder} does not exist; set its path in config/objects.tsv, or in object.masks.keep"
+        )
+    files, originals = masks_by_name([view.name for view in views], folder), read_cameras(sparse)
+    masks: dict[str, Mask] = {}
+    unusable: dict[str, str] = {}
+    for view in views:
+        file = files.get(view.name)
+        if file is None or view.name not in originals:
+            continue
+        try:
+            mask = _read(file, originals[view.name]).astype(np.float32)
+            masks[view.name] = undistort_picture(mask, originals[view.name], view) > 0.5
+        except StageError as error:
+            unusable[view.name] = str(error)
+    if not masks and unusable:
+        raise StageError(f"none of {len(unusable)} masks in {folder} can be used; {next(iter(unusable.values()))}")
+    if not masks:
+        pictures = pictures_below(folder)
+        example = next(iter(pictures), "none")
+        raise StageError(
+            f"masks that match no photo: {len(pictures)} masks in {folder} (first: {example}), photos are named like "
+            f"{views[0].name}; name a mask like its photo, with or without _mask"
+        )
+    print(f"{len(masks)} of {len(views)} photos have a mask in {folder}", flush=True)
+    return masks, unusable
+
+
+def _read(file: Path, camera: pycolmap.Camera) -> Mask:
+    """The mask (H, W) of a photo that a camera took; StageError when it cannot be read or is of another picture."""
+    try:
+        mask = matte_of(read_raw(file))
+    except StageError:
+        raise StageError(f"the supplied mask {file} cannot be read; export it again as PNG") from None
+    height, width = mask.shape
+    if abs(width * camera.height / (height * camera.width) - 1) > SHAPE_TOLERANCE:
+        raise StageError(
+            f"the supplied mask {file} is {width} x {height} pixels, its photo {camera.width} x {camera.height}; export"
+            " it at the photo's size"
+        )
+    return mask

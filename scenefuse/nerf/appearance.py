@@ -11,18 +11,19 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, max_pool2d
 
-from scenefuse.geometry.consistency import DEPTH_JUMP
-from scenefuse.geometry.surface import COLOR_NOISE
 from scenefuse.nerf.field import Field
-from scenefuse.nerf.losses import COLOR_DELTA
-from scenefuse.nerf.rays import PhotoTensors, dilate
+from scenefuse.nerf.rays import COLOR_DELTA, PhotoTensors, dilate
 from scenefuse.nerf.render import Occupancy, render_view
 
 # Colours of a place are compared in photos shrunk to at most this width: depths need not be exact to a pixel for it.
 SMALL_PX = 96
 # A place is compared in the photos taken nearest to the one it is found in, where both show it.
 COMPARED_PHOTOS = 24
+# Depths that differ by this share are of two surfaces: no slanted one has such a step.
+DEPTH_JUMP = 0.03
 MIN_OPACITY = 0.9
+# Pixels nearer to black are mostly noise, and nearer to white mostly clipped.
+COLOR_MARGIN = 0.03
 # A photo that was not trained on gets the mean gains of this many nearest training photos.
 GAIN_NEIGHBOURS = 2
 # Sharpness compares details finer than a Gaussian's sigma of one pixel with those between it and this one.
@@ -117,7 +118,7 @@ def _shared(photos: PhotoTensors, depths: Tensor, a: int, b: int) -> tuple[Tenso
     ours, theirs = (photos.images[view, y, x] / 255.0 for view, y, x in ((a, rows, columns), (b, v, u)))
     kept = (x[:, 2] > 0) & ((there > 0) & (there < torch.tensor([width, height]))).all(1)
     kept &= (depths[b, v, u] - x[:, 2]).abs() < DEPTH_JUMP * x[:, 2]
-    kept &= ((torch.stack([ours, theirs]) - 0.5).abs() < 0.5 - COLOR_NOISE).all(2).all(0)
+    kept &= ((torch.stack([ours, theirs]) - 0.5).abs() < 0.5 - COLOR_MARGIN).all(2).all(0)
     radius2 = [squared_radius(p, k.expand(len(p), 3, 3), width, height) for p, k in ((uv, k_a), (there, k_b))]
     index = torch.ones(int(kept.sum()), dtype=torch.int64)
     return index * a, index * b, torch.stack(radius2, 1)[kept], (ours[kept] / theirs[kept]).log()

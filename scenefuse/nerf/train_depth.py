@@ -29,7 +29,7 @@ from scenefuse.nerf.prior_inputs import (
     network_inputs,
 )
 from scenefuse.nerf.prior_training import Recipe, loss_quantities, predict, prepare_torch, train_network
-from scenefuse.nerf.refine_depth import MAP_AGREEMENT, confirm, write_prior
+from scenefuse.nerf.rendered_maps import MAP_AGREEMENT, confirm, write_prior
 from scenefuse.photos.views import load_views
 
 Content = dict[str, Any]

@@ -15,14 +15,14 @@ from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.geometry.surface import ends_of
 from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
+from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.rendered_maps import RenderedMapSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe
 from scenefuse.photos.pictures import read_depth, read_gray, read_normals, read_rgb
 from scenefuse.photos.sheets import TILE_PX, Image, depth_colors, draw_sheet, save_png
-from scenefuse.sfm.import_photos import import_photos
+from scenefuse.sfm.given_cameras import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
 
 

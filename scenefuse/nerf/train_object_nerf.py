@@ -19,14 +19,14 @@ from scenefuse.core.transforms import Sim3
 from scenefuse.mvs.sparse_depths import own_points, sparse_depths
 from scenefuse.nerf.appearance import measured_sharpness, photo_weights
 from scenefuse.nerf.field import FieldSettings, kernels_on
-from scenefuse.nerf.losses import SOLID_OPACITY, LossWeights
-from scenefuse.nerf.rays import PhotoTensors
-from scenefuse.nerf.refine_depth import DepthPrior, read_prior
+from scenefuse.nerf.rays import SOLID_OPACITY, LossWeights, PhotoTensors
 from scenefuse.nerf.rendered_maps import (
+    DepthPrior,
     RenderedMaps,
     RenderedMapSettings,
     measure_quality,
     read_nerf,
+    read_prior,
     render_maps,
     write_maps,
     write_nerf,

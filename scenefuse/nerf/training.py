@@ -23,11 +23,22 @@ from scenefuse.core.checkpoints import (
     step_generator,
 )
 from scenefuse.core.stage import setting
-from scenefuse.nerf import losses
 from scenefuse.nerf.appearance import Appearance, find_appearance, squared_radius
 from scenefuse.nerf.field import Field, FieldSettings, coarse_to_fine
-from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.rays import SURFACE_DEPTH, PhotoTensors, PixelBatch, PixelPool, camera_rays, draw_batch, pixel_pool
+from scenefuse.nerf.rays import (
+    SURFACE_DEPTH,
+    LossWeights,
+    PhotoTensors,
+    PixelBatch,
+    PixelPool,
+    camera_rays,
+    color_loss,
+    depth_loss,
+    draw_batch,
+    mask_loss,
+    pixel_pool,
+    sparsity_loss,
+)
 from scenefuse.nerf.render import UNIFORM_SHARE, Composited, Occupancy, RayPrior, RaySamples, composite, march, updated
 
 # Steps between updates of the grid (Mueller et al. 2022, appendix E.2).
@@ -366,7 +377,7 @@ def _photometric(
     target = matte * batch.color[ray] + (1 - matte) * shown
     error = ((composed.detach() - target) ** 2)[inside].mean().clamp(min=1e-10)
     weight = inside if training.photo_weight is None else inside * training.photo_weight.to(view.device)[view]
-    return losses.color_loss(composed, target, weight), -10 * torch.log10(error)
+    return color_loss(composed, target, weight), -10 * torch.log10(error)
 
 
 def _geometric(weights: LossWeights, rendered: Rendered) -> dict[str, Tensor]:
@@ -375,11 +386,11 @@ def _geometric(weights: LossWeights, rendered: Rendered) -> dict[str, Tensor]:
     terms = {}
     if weights.depth_weight > 0:
         known = rays.prior.distance[ray], rays.confidence[ray]
-        terms["depth"] = losses.depth_loss(seen.distance, seen.opacity, *known)
+        terms["depth"] = depth_loss(seen.distance, seen.opacity, *known)
     if weights.mask_weight > 0:
-        terms["mask"] = losses.mask_loss(seen.opacity, batch.matte[ray])
+        terms["mask"] = mask_loss(seen.opacity, batch.matte[ray])
     if weights.sparsity_weight > 0:
-        terms["sparsity"] = losses.sparsity_loss(rendered.sigma, rendered.drawn.delta, batch.inside[ray])
+        terms["sparsity"] = sparsity_loss(rendered.sigma, rendered.drawn.delta, batch.inside[ray])
     return terms
 
 

@@ -19,7 +19,7 @@ from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
 from scenefuse.nerf.monodepth import sample
 from scenefuse.nerf.prior_inputs import DepthPhotos, depth_photos
 from scenefuse.nerf.prior_training import Recipe, loss_quantities, optimise, predict, prepare_torch
-from scenefuse.nerf.refine_depth import DepthPrior, read_stage_maps, write_prior
+from scenefuse.nerf.rendered_maps import DepthPrior, read_stage_maps, write_prior
 from scenefuse.nerf.train_depth import align_maps
 from scenefuse.nerf.train_object_nerf import MIN_CONFIDENCE
 from scenefuse.paper import monocular

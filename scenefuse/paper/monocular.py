@@ -32,7 +32,7 @@ from scenefuse.nerf.monodepth import (
 )
 from scenefuse.nerf.prior_inputs import DepthPhotos
 from scenefuse.nerf.prior_training import Objective, PhotoScale, Recipe, huber, reprojection_error
-from scenefuse.nerf.refine_depth import MAP_AGREEMENT
+from scenefuse.nerf.rendered_maps import MAP_AGREEMENT
 from scenefuse.nerf.train_depth import residual_at_checks
 from scenefuse.photos.views import Views
 

@@ -29,10 +29,9 @@ from scenefuse.core.stage import quantity, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.geometry.icp import ScaleRange, triples_of_one_scale
 from scenefuse.geometry.surface import SCORE_FRACTION
-from scenefuse.register.agreement import draw_alignment
 from scenefuse.register.coarse import coarse_quantities
 from scenefuse.register.decision import FineSettings, tilt_deg
-from scenefuse.register.fine import ledger_row, pose_quantities
+from scenefuse.register.fine import draw_alignment, ledger_row, pose_quantities
 from scenefuse.register.problem import (
     SURFACE_POINTS,
     Constraints,

@@ -15,9 +15,8 @@ from torch import Tensor
 from scenefuse.core.stage import quantity, read_json, write_json
 from scenefuse.nerf.appearance import DEPTH_JUMP
 from scenefuse.nerf.field import Field, FieldSettings, encode
-from scenefuse.nerf.losses import DEPTH_DELTA, SOLID_OPACITY, LossWeights
 from scenefuse.nerf.prior_training import LEARNING_RATE, Recipe
-from scenefuse.nerf.rays import PhotoTensors, dilate
+from scenefuse.nerf.rays import DEPTH_DELTA, SOLID_OPACITY, LossWeights, PhotoTensors, dilate
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, prepare_device, train_stage
 from scenefuse.nerf.training import OCCUPANCY_EVERY, Nerf, NerfRecipe, Rendered, Schedule
 from scenefuse.photos.views import load_views

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from scenefuse.core.project import Project
 from scenefuse.core.stage import StageError, read_json
-from scenefuse.crop.one_photo import MIN_INSIDE
+from scenefuse.crop.marked import MIN_INSIDE
 from scenefuse.marks.clicks import Kind
 from scenefuse.photos.photo_files import frame_name, thin_out, upright_size
 from scenefuse.photos.photos import photo_names, without_copies

@@ -16,7 +16,7 @@ from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3
 from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, moved_about, similarity_rows
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface
-from scenefuse.register.score import COLOR_NOISE
+from scenefuse.register.score import MIN_COLOR_NOISE
 from scenefuse.register.uncertainty import Uncertainty
 
 # Object points from which a scene point may come: those within two deviations, at the usual spacing and noise.
@@ -170,7 +170,7 @@ def _measured_noise(obj: Surface, scene: Surface, found: Explanation, floor: flo
     gain = np.clip(together / np.maximum(spread, 1e-9), 0.25, 4.0)
     noise = Noise(place, 1.0, gain, mean_theirs - gain * mean_mine)
     off = (_color_residual(obj, scene, found.partner, noise) ** 2).sum(2)
-    return Noise(place, max(COLOR_NOISE, float(np.sqrt((weight * off).sum() / (3 * total)))), gain, noise.bias)
+    return Noise(place, max(MIN_COLOR_NOISE, float(np.sqrt((weight * off).sum() / (3 * total)))), gain, noise.bias)
 
 
 def _derivatives(obj: Surface, scene: Surface, pose: Sim3, noise: Noise, found: Explanation) -> MostLikely:

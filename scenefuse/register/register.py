@@ -17,10 +17,9 @@ from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import MIN_POINTS, around_marks, crop_marked
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.marks.clicks import ScenePoints, read_points
-from scenefuse.register.agreement import AgreementSettings, registration_metrics
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg
-from scenefuse.register.fine import pose_quantities
+from scenefuse.register.fine import AgreementSettings, pose_quantities, registration_metrics
 from scenefuse.register.places import likely_places
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, estimates, prior
 from scenefuse.register.refinement import Outcome, refine_hypotheses

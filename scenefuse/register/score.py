@@ -7,10 +7,12 @@ import numpy as np
 
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.geometry.depth_test import FreeSpace
-from scenefuse.geometry.surface import COLOR_NOISE, Pairs, Surface, pair
+from scenefuse.geometry.surface import Pairs, Surface, pair
 
 # Beta of the F-beta score: recall weighs more, since the scene shows only a part of the object.
 RECALL_WEIGHT = 2.0
+# Noise of colours (standard deviation, 0..1) at least; those that vary less say nothing about the pose.
+MIN_COLOR_NOISE = 0.03
 # Relative lead of a score by which one pose is better than another.
 MIN_MARGIN = 0.04
 # Poses that differ by less than these are one: an angle, the scale, the centre as a share of the diagonal.
@@ -96,7 +98,7 @@ def color_agreement(obj: Surface, scene: Surface, pairs: Pairs) -> float | None:
     """
     if obj.colors is None or scene.colors is None:
         return None
-    if min(float(c.std(0).max()) for c in (obj.colors, scene.colors)) < COLOR_NOISE:
+    if min(float(c.std(0).max()) for c in (obj.colors, scene.colors)) < MIN_COLOR_NOISE:
         return None
     if len(pairs.distance) < 30:
         return 0.0

@@ -24,8 +24,7 @@ from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, s
 from scenefuse.photos.geodesy import local_frame
 from scenefuse.photos.photos import Photo, gps_positions, read_photos
 from scenefuse.sfm.colmap import cancellable, require_database
-from scenefuse.sfm.features import FEW_FEATURES
-from scenefuse.sfm.guided import match_guided
+from scenefuse.sfm.features import FEW_FEATURES, match_guided
 
 Pair = tuple[str, str]
 

@@ -1,7 +1,7 @@
 """Fuse all registered objects of a scene into one cloud."""
 
 from scenefuse.core.stage import run
-from scenefuse.fuse.complete_scene import complete_scene
+from scenefuse.fuse.write import complete_scene
 
 if __name__ == "__main__":
     run(complete_scene)

@@ -17,10 +17,9 @@ from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.metrics.truth import fit_cameras, read_cameras, read_posed, registration_error
 from scenefuse.paper.register_as_paper import register_as_paper
-from scenefuse.register.agreement import AgreementSettings, registration_metrics
 from scenefuse.register.coarse import CoarseSettings, register_coarsely
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.fine import ConstraintFiles, register_finely
+from scenefuse.register.fine import AgreementSettings, ConstraintFiles, register_finely, registration_metrics
 from scenefuse.register.problem import Inputs, ScaleSettings
 
 OBJECTS = ("house", "balloon", "sculpture")

@@ -14,9 +14,8 @@ from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.settings import ROOT, build, read_settings
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.geometry.visual_hull import mask_iou
-from scenefuse.masks.make_masks import MaskInputs, make_masks
+from scenefuse.masks.make_masks import MaskInputs, make_masks, supplied_masks
 from scenefuse.masks.segmentation import MaskSettings
-from scenefuse.masks.supplied import supplied_masks
 from scenefuse.photos.workspace import read_workspace
 from scenefuse.report.figures import inner, upright
 from scenefuse.report.render import orbit_camera, point_radii, render

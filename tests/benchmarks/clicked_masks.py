@@ -21,9 +21,9 @@ from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask, mask_iou
 from scenefuse.marks.clicks import Click, Clicks
 from scenefuse.masks import segmentation
+from scenefuse.masks.make_masks import supplied_masks
 from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.segmentation import MaskSettings, score_masks
-from scenefuse.masks.supplied import supplied_masks
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.photo_files import masks_by_name
 from scenefuse.photos.pictures import read_mask

@@ -23,7 +23,7 @@ from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import quantity, run, write_json
 from scenefuse.metrics.truth import Cameras, read_cameras, read_mesh, sample_surface, visible
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
-from scenefuse.nerf.refine_depth import refine_depth
+from scenefuse.nerf.rendered_maps import refine_depth
 from scenefuse.nerf.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 
@@ -35,8 +35,8 @@ PARTS = {
     ("scenefuse.nerf.train_depth", "network_inputs"): "stereo",
     ("scenefuse.nerf.train_depth", "train_network"): "training",
     ("scenefuse.nerf.train_depth", "confirm"): "refinement",
-    ("scenefuse.nerf.refine_depth", "load_views"): "loading",
-    ("scenefuse.nerf.refine_depth", "confirm"): "refinement",
+    ("scenefuse.nerf.rendered_maps", "load_views"): "loading",
+    ("scenefuse.nerf.rendered_maps", "confirm"): "refinement",
     ("scenefuse.nerf.train_object_nerf", "load_views"): "loading",
     ("scenefuse.nerf.train_object_nerf", "read_prior"): "prior",
     ("scenefuse.nerf.train_object_nerf", "find_volume"): "visual hull",

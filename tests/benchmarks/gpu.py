@@ -31,8 +31,8 @@ from scenefuse.core.stage import StageError, run
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.nerf.field import FieldSettings, encode, hash_grid
-from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.prior_training import Recipe, optimise, predict
+from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.render import UNIFORM_SHARE, march, no_prior, render_view
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, keep_memory, new_nerf, train
 
@@ -380,7 +380,7 @@ def patch_match(folder: Path) -> Row:
 def whole_object(folder: Path) -> Row:
     """The four stages of a finished object again, on the GPU: held-out PSNR beside the CPU's."""
     from scenefuse.core.stage import read_json, value
-    from scenefuse.nerf.refine_depth import refine_depth
+    from scenefuse.nerf.rendered_maps import refine_depth
     from scenefuse.nerf.train_depth import DepthTrainingSettings, train_depth
     from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 

@@ -22,7 +22,7 @@ from scenefuse.nerf.train_object_nerf import NerfSettings, photo_tensors
 from scenefuse.nerf.training import Nerf, Training, keep_memory, new_nerf, train
 from scenefuse.nerf.volume import find_volume, silhouettes
 from scenefuse.photos.views import load_views
-from scenefuse.sfm.import_photos import import_photos
+from scenefuse.sfm.given_cameras import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
 
 GOALS_DB = (25, 28, 30, 32)

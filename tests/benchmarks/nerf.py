@@ -23,7 +23,7 @@ from scenefuse.geometry.matcher import Matcher
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf import field, kernels
 from scenefuse.nerf.field import FieldSettings, encode, encode_reference, hash_grid, kernels_on
-from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.render import UNIFORM_SHARE, Occupancy, march, no_prior
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, keep_memory, new_nerf, train
 from scenefuse.photos.workspace import View

@@ -29,8 +29,7 @@ from scenefuse.metrics.evaluate_object import (
 )
 from scenefuse.metrics.truth import SAMPLES, belongs_to_object, distances
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
-from scenefuse.nerf.refine_depth import refine_depth
-from scenefuse.nerf.rendered_maps import psnr
+from scenefuse.nerf.rendered_maps import psnr, refine_depth
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.paper.estimate_as_paper import StageOutputs, estimate_as_paper
 from scenefuse.paper.monocular import MonocularSettings

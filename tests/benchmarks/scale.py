@@ -35,9 +35,9 @@ from scenefuse.core.stage import quantity, read_json, run, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import CropInputs, around_marks, crop_scene
-from scenefuse.fuse.complete_scene import CompletionInputs, complete_scene
 from scenefuse.fuse.fuse_object import FusionInputs, FusionOutputs, fuse_object
 from scenefuse.fuse.modes import FusionSettings
+from scenefuse.fuse.write import CompletionInputs, complete_scene
 from scenefuse.register.coarse import CoarseSettings, register_coarsely
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.fine import register_finely

@@ -11,8 +11,8 @@ import numpy as np
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import run, value
 from scenefuse.core.transforms import Sim3, rotation_angle_deg
-from scenefuse.register.agreement import draw_alignment
 from scenefuse.register.align_models import AlignmentSettings, align_landmarks
+from scenefuse.register.fine import draw_alignment
 from scenefuse.register.landmarks import read_landmarks
 from scenefuse.register.register import RegistrationSettings, register_clouds
 

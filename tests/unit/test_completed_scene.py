@@ -11,9 +11,9 @@ from scenefuse.core.job_records import JobRecords
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.core.version import VERSION
-from scenefuse.fuse.complete_scene import CompletionInputs, complete_scene, without_overlaps
 from scenefuse.fuse.fuse_object import FusionInputs, FusionOutputs, fuse_object
 from scenefuse.fuse.modes import FusionSettings, fuse_by_distance
+from scenefuse.fuse.write import CompletionInputs, complete_scene, without_overlaps
 
 SETTINGS = FusionSettings(mode="fill")
 POSE = Sim3(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))

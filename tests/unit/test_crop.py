@@ -16,7 +16,7 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.core.transforms import Sim3
 from scenefuse.crop.crop_cloud import CropSettings, crop_cloud, in_wide_hull, least_footprint
 from scenefuse.crop.crop_scene import CropInputs, crop_scene
-from scenefuse.crop.vote import count, read_masked_views, vote
+from scenefuse.crop.marked import count, read_masked_views, vote
 from scenefuse.geometry.ground import fit_ground
 
 Z = np.array([0.0, 0.0, 1.0])

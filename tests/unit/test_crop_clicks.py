@@ -12,7 +12,7 @@ from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import look_at
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import CropInputs, crop_scene
-from scenefuse.crop.one_photo import SceneClicks
+from scenefuse.crop.marked import SceneClicks
 from scenefuse.marks.clicks import read_points
 from scenefuse.photos.workspace import View, write_model
 

@@ -8,8 +8,8 @@ from support.textured_plane import plane_views, speckled, wrong_depths
 
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.nerf import refine_depth as feedback
-from scenefuse.nerf.refine_depth import DepthPrior, confirm, read_prior, write_prior
+from scenefuse.nerf import rendered_maps as feedback
+from scenefuse.nerf.rendered_maps import DepthPrior, confirm, read_prior, write_prior
 from scenefuse.photos.pictures import read_depth, write_depth
 
 MATCHING = RefinementSettings(match_reach_px=8.0)

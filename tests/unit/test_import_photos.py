@@ -16,15 +16,15 @@ from support.painted_sphere import CENTER, RADIUS, sphere_views
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import StageError, read_json, value
-from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates
+from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.render import RenderedView
 from scenefuse.nerf.rendered_maps import RenderedMapSettings, measure_quality
 from scenefuse.nerf.train_nerf import TrainingOptions, nerf_settings, train_nerf
 from scenefuse.nerf.training import NerfRecipe
 from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
 from scenefuse.photos.views import load_views
-from scenefuse.sfm.import_photos import import_photos
+from scenefuse.sfm.given_cameras import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
 
 LEGO = Path(__file__).resolve().parents[3] / "shared/data/lego"

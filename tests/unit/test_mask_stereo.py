@@ -10,7 +10,7 @@ from support.photographed_plane import BLANK, photographs
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.propagation import NO_CLICKS, propagate
-from scenefuse.masks.stereo_points import with_stereo_points
+from scenefuse.masks.segmentation import with_stereo_points
 from scenefuse.masks.votes import known_points, voter_of
 from scenefuse.photos.workspace import Workspace
 

@@ -18,7 +18,7 @@ from scenefuse.metrics.completion import (
     surface_variation,
 )
 from scenefuse.metrics.compute_metrics import box_size, compute_metrics, compute_scene_metrics
-from scenefuse.register.agreement import SAMPLED_POINTS, registration_metrics, self_consistency
+from scenefuse.register.fine import SAMPLED_POINTS, registration_metrics, self_consistency
 
 SETTINGS = MetricSettings(
     variation_spacings=8.0,

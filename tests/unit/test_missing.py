@@ -14,8 +14,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.fuse.find_missing import COLUMNS, MissingInputs, MissingOutputs, find_missing, photo_rows
-from scenefuse.fuse.missing import Lack, find_missing_surface
-from scenefuse.fuse.next_photos import Plan, plan_stations
+from scenefuse.fuse.missing import Lack, Plan, find_missing_surface, plan_stations
 from scenefuse.geometry.photo_check import pack
 from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.workspace import View, write_model

@@ -20,7 +20,7 @@ from scenefuse.nerf.appearance import (
     without_appearance,
 )
 from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.rendered_maps import fitted_to_left_half, right_half
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
 

@@ -14,8 +14,8 @@ from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
+from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.rendered_maps import RenderedMapSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe, Schedule

@@ -17,8 +17,7 @@ from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.consistency import back_project, compare, normals_from_depth, others, surface_points
 from scenefuse.geometry.photo_check import MAX_PHOTOS
 from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.rays import dilate, draw_batch, pixel_pool
+from scenefuse.nerf.rays import LossWeights, dilate, draw_batch, pixel_pool
 from scenefuse.nerf.render import render_view
 from scenefuse.nerf.rendered_maps import psnr, silhouette_iou, ssim
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train

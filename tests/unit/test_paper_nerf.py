@@ -11,8 +11,7 @@ from support.painted_sphere import photos_of, sphere_views, sphere_volume
 import scenefuse.nerf.training as training_module
 from scenefuse.core.machine import use_threads
 from scenefuse.nerf.field import Field, FieldSettings, encode
-from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.rays import draw_batch
+from scenefuse.nerf.rays import LossWeights, draw_batch
 from scenefuse.nerf.training import Nerf, NerfRecipe, Schedule, Training, new_nerf, train
 from scenefuse.paper.train_nerf_as_paper import RANK_MARGIN, RANK_WEIGHT, OrderAndEdges, rank_loss
 

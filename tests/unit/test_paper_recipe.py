@@ -16,8 +16,8 @@ from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Sim3, rotation_between
 from scenefuse.nerf import prior_training as training
 from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.prior_training import Recipe, optimise, predict
+from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import NerfRecipe, Schedule
 from scenefuse.paper import train_nerf_as_paper as nerf_stage

@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 from scenefuse.core.transforms import Sim3
-from scenefuse.crop.vote import Masked, vote
+from scenefuse.crop.marked import Masked, vote
 from scenefuse.geometry.ground import Ground
 from scenefuse.geometry.photo_check import covering
 from scenefuse.geometry.visual_hull import Box, Outline, least_framing

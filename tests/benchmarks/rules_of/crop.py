@@ -2,8 +2,7 @@
 
 Trials are the demo's objects in the folder that RESULTS names, each by its masks, by fiducials, and by five clicks in
 one scene photo (two photos each); planted scenes with sloping ground and bushes; and finished real captures, folders
-in CAPTURES (separated by colons), of which nothing is known: both shares are against the crop with all rules. A rule of
-a mode is tried in that mode only.
+in CAPTURES (separated by colons), of which nothing is known: both shares are against the crop with all rules.
 """
 
 import os
@@ -151,15 +150,14 @@ _votes: dict[int, Any] = {}
 
 def evaluate(number: int, rule: Rule | None) -> dict[str, Any]:
     """Both shares of a crop."""
-    trial, mode = trial_of(number), trial_of(number).kind.split(", ")[-1]
+    trial = trial_of(number)
     own = _as_shipped(number) if trial.own is None else trial.own
     row: dict[str, Any] = {"kind": trial.kind, "kept": 0.0, "pure": 0.0, "points": 0}
     before, of = crop_scene.vote, "" if rule is None else rule.where.rpartition(".")[0]
-    if of not in (V, S):
+    if of not in (M, S):
         crop_scene.vote = lambda *given: _votes.get(number) or _votes.setdefault(number, before(*given))
-    elsewhere = {V: "masks", P: "clicks"}.get(of, mode) != mode
     try:
-        found = _as_shipped(number) if elsewhere else trial.crop()
+        found = trial.crop()
     except StageError as error:
         return row | {"reason": str(error)[:80]}
     finally:
@@ -186,20 +184,20 @@ def _without_others(crop: Any) -> Any:
     return lambda scene, marks, up, settings, other=None: crop(scene, marks, up, settings)
 
 
-C, S, V, P = (f"scenefuse.crop.{name}" for name in ("crop_cloud", "crop_scene", "vote", "one_photo"))
+C, S, M = (f"scenefuse.crop.{name}" for name in ("crop_cloud", "crop_scene", "marked"))
 RULES = [
     Rule("ground goes", f"{C}.ground_under", lambda _: lambda *__: (None, [])),
     Rule("loose parts go", f"{C}._without_loose_parts", lambda _: lambda points, inside, *__: (inside, [])),
     Rule(
         "what masks call something else goes", f"{S}.crop_cloud", lambda f: lambda a, b, c, d, other=None: f(a, b, c, d)
     ),
-    Rule("a vote needs an own point nearby", f"{V}.MAX_BEYOND_POINTS", constant(9.0)),
-    Rule("what hides takes no vote", f"{V}.SURFACE_SPACINGS", constant(1e9)),
-    Rule("enough photos frame a point", f"{V}.least_framing", lambda _: lambda *__: 0),
+    Rule("a vote needs an own point nearby", f"{M}.MAX_BEYOND_POINTS", constant(9.0)),
+    Rule("what hides takes no vote", f"{M}.SURFACE_SPACINGS", constant(1e9)),
+    Rule("enough photos frame a point", f"{M}.least_framing", lambda _: lambda *__: 0),
     Rule("two pairing distances, ground's thickness", f"{C}.SCORE_FRACTION", constant(0.0)),
-    Rule("all clicks outside apart by planes", f"{P}.MAX_VARIATION", constant(0.0)),
-    Rule("growth is limited", f"{P}.MAX_GROWTH", constant(1e9)),
-    Rule("strays mark nothing when growing", f"{P}.without_strays", lambda _: lambda points, _: points),
+    Rule("all clicks outside apart by planes", f"{M}.MAX_VARIATION", constant(0.0)),
+    Rule("growth is limited", f"{M}.MAX_GROWTH", constant(1e9)),
+    Rule("strays mark nothing when growing", f"{M}.without_strays", lambda _: lambda points, _: points),
     Rule("strays mark no foot", f"{C}.STRAY_SHARE", constant(0.0)),
     Rule("ground not over a tenth of the height", f"{C}.FOOT_SHARE", constant(9.0)),
     Rule("ground rises little", f"{C}.MAX_RISE", constant(9.0)),
@@ -208,9 +206,7 @@ RULES = [
     *around("foot", f"{C}.FOOT_SHARE"),
     *around("rise", f"{C}.MAX_RISE"),
     *around("ring", f"{C}.RING_FRACTION"),
-    *around("cells", f"{V}.CELL_SPACINGS"),
-    *around("thickness of what hides", f"{V}.SURFACE_SPACINGS"),
-    *around("own points' reach", f"{V}.MAX_BEYOND_POINTS"),
-    *around("ray spacings", f"{P}.CELL_SPACINGS"),
-    *around("depth spacings", f"{P}.SURFACE_SPACINGS"),
+    *around("cells", f"{M}.CELL_SPACINGS"),
+    *around("thickness of what hides", f"{M}.SURFACE_SPACINGS"),
+    *around("own points' reach", f"{M}.MAX_BEYOND_POINTS"),
 ]

@@ -20,11 +20,11 @@ from rules import Rule
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.geometry.visual_hull import Mask, mask_iou
 from scenefuse.marks.clicks import Clicks, read_points
+from scenefuse.masks.make_masks import supplied_masks
 from scenefuse.masks.prompts import NO_PIXELS
 from scenefuse.masks.sam2 import Sam2Onnx
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.masks.segmentation import MaskSettings, masks_from_prompts, score_masks
-from scenefuse.masks.supplied import supplied_masks
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.workspace import Workspace, read_workspace
 

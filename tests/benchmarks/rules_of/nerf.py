@@ -18,7 +18,7 @@ from rules import Rule
 
 from scenefuse.core.stage import read_json, value
 from scenefuse.metrics.evaluate_object import ObjectTruth, depth_results, read_object_truth
-from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe, Schedule
 
