@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -34,10 +33,10 @@ from scenefuse.masks.segmentation import MaskSettings, Prompted, ScoredMasks, ma
 from scenefuse.masks.target import target_from_points
 from scenefuse.masks.votes import points_in_masks
 from scenefuse.photos.frames import original_sizes
-from scenefuse.photos.photo_files import masks_by_name, pictures_below
-from scenefuse.photos.photos import SHAPE_TOLERANCE
-from scenefuse.photos.pictures import matte_of, read_raw, write_picture
+from scenefuse.photos.photo_files import masks_by_name
+from scenefuse.photos.pictures import write_picture
 from scenefuse.photos.workspace import View, Workspace, read_cameras, read_workspace
+from scenefuse.sfm.given_cameras import no_match, read_mask
 from scenefuse.sfm.undistort import undistort_picture
 
 # Width of a photo on the contact sheet, and photos side by side.
@@ -342,33 +341,14 @@ def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[
         if file is None or view.name not in originals:
             continue
         try:
-            mask = _read(file, originals[view.name]).astype(np.float32)
-            masks[view.name] = undistort_picture(mask, originals[view.name], view) > 0.5
+            camera = originals[view.name]
+            mask = read_mask(file, (camera.width, camera.height)).astype(np.float32)
+            masks[view.name] = undistort_picture(mask, camera, view) > 0.5
         except StageError as error:
             unusable[view.name] = str(error)
     if not masks and unusable:
         raise StageError(f"none of {len(unusable)} masks in {folder} can be used; {next(iter(unusable.values()))}")
     if not masks:
-        pictures = pictures_below(folder)
-        example = next(iter(pictures), "none")
-        raise StageError(
-            f"masks that match no photo: {len(pictures)} masks in {folder} (first: {example}), photos are named like "
-            f"{views[0].name}; name a mask like its photo, with or without _mask"
-        )
+        raise StageError(no_match(folder, views[0].name))
     print(f"{len(masks)} of {len(views)} photos have a mask in {folder}", flush=True)
     return masks, unusable
-
-
-def _read(file: Path, camera: pycolmap.Camera) -> Mask:
-    """The mask (H, W) of a photo that a camera took; StageError when it cannot be read or is of another picture."""
-    try:
-        mask = matte_of(read_raw(file))
-    except StageError:
-        raise StageError(f"the supplied mask {file} cannot be read; export it again as PNG") from None
-    height, width = mask.shape
-    if abs(width * camera.height / (height * camera.width) - 1) > SHAPE_TOLERANCE:
-        raise StageError(
-            f"the supplied mask {file} is {width} x {height} pixels, its photo {camera.width} x {camera.height}; export"
-            " it at the photo's size"
-        )
-    return mask

@@ -269,15 +269,19 @@ def _described(photos: list[PosedPhoto], lenses: list[Lens], kept: list[View]) -
 def _no_masks(data: Path, photos: list[PosedPhoto], masks: Path | None) -> str:
     """Why no photo has a mask, and what to do."""
     if masks is not None:
-        files = pictures_below(masks)
-        example = next(iter(files), "none")
-        return (
-            f"masks that match no photo: {len(files)} masks in {masks} (first: {example}), photos are named like "
-            f"{photos[0].name}; name a mask like its photo, with or without _mask"
-        )
+        return no_match(masks, photos[0].name)
     return (
         f"the photos of {data} have no masks; give a folder of masks with --masks (white on the object, named like the "
         "photos), mask_path in the JSON, or photos with an alpha channel"
+    )
+
+
+def no_match(folder: Path, photo: str) -> str:
+    """What is wrong with a folder of masks that belong to none of the photos, and what to do; `photo`: name of one."""
+    masks = pictures_below(folder)
+    return (
+        f"masks that match no photo: {len(masks)} masks in {folder} (first: {next(iter(masks), 'none')}), photos are"
+        f" named like {photo}; name a mask like its photo, with or without _mask"
     )
 
 
@@ -327,15 +331,27 @@ def _mask(file: Path | None, picture: Picture) -> Picture | None:
     """A mask file at the photo's size, 0 or 255 but where it was resampled; None without a file."""
     if file is None:
         return None
-    matte = read_raw(file)
-    height, width = picture.shape[:2]
-    if abs(matte.shape[1] / matte.shape[0] * height / width - 1) > SHAPE_TOLERANCE:
+    size = picture.shape[1::-1]
+    return np.asarray(cv2.resize(255 * read_mask(file, size).astype(np.uint8), size, interpolation=cv2.INTER_AREA))
+
+
+def read_mask(file: Path, size: tuple[int, ...]) -> NDArray[np.bool_]:
+    """A mask (H, W), of any size, of a photo of this (width, height).
+
+    Raises:
+        StageError: it cannot be read, or is of another picture.
+    """
+    try:
+        mask = matte_of(read_raw(file))
+    except StageError:
+        raise StageError(f"the mask {file} cannot be read; export it again as PNG") from None
+    (height, width), (photo_width, photo_height) = mask.shape, size
+    if abs(width * photo_height / (height * photo_width) - 1) > SHAPE_TOLERANCE:
         raise StageError(
-            f"the mask {file} has {matte.shape[1]} x {matte.shape[0]} pixels, but its photo {width} x {height}; "
-            "make masks of the photos as they are"
+            f"the mask {file} is {width} x {height} pixels, its photo {photo_width} x {photo_height}; export it at the"
+            " photo's size"
         )
-    whole = matte_of(matte).astype(np.uint8) * 255
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return mask
 
 
 def _bled(picture: Picture, alpha: Picture) -> Picture:

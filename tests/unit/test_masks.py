@@ -246,9 +246,7 @@ def test_bad_supplied_masks_alone_are_an_error_in_one_sentence(capture, tmp_path
     supplied.mkdir()
     for k in range(PHOTOS):
         (supplied / f"f{k}.png").write_bytes(b"no picture")
-    with pytest.raises(
-        StageError, match="none of 8 masks in .* can be used; the supplied mask .*f0.png cannot be read"
-    ):
+    with pytest.raises(StageError, match="none of 8 masks in .* can be used; the mask .*f0.png cannot be read"):
         run_stage(capture, tmp_path / "x", method="supplied", prompts=None, supplied=supplied)
     assert not (tmp_path / "x").exists()
 
