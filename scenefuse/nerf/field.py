@@ -113,7 +113,7 @@ def kernels_on(device: str) -> str:
 
 def kernel_module(device: torch.device) -> tuple[Any, Callable[[Tensor], Any]]:
     """The module whose kernels run on a device, and how they take a tensor; no module: plain PyTorch has to do it."""
-    if device.type == "cpu" and kernels.AVAILABLE:
+    if device.type == "cpu":
         return kernels, lambda tensor: tensor.detach().numpy()
     if device.type == "cuda" and triton_kernels is not None:
         return triton_kernels, Tensor.detach

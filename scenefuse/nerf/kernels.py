@@ -5,41 +5,20 @@ Loops are arranged so that no two threads write to one place: results do not dep
 large levels are fetched ahead of their use, since the processor cannot guess them.
 """
 
-from typing import Any
-
+import numba as nb
 import numpy as np
+from llvmlite import ir
+from numba import prange
+from numba.extending import intrinsic
 
-nb: Any = None
-prange: Any = range
-try:
-    import numba as nb
-    from llvmlite import ir
-    from numba import prange
-    from numba.extending import intrinsic
-except ImportError:  # the PyTorch twins do the work
-    pass
-
-AVAILABLE = nb is not None
 # Those of the hash along y and z; along x it takes the vertex itself.
 PRIMES = (2654435761, 805459861)
 PY, PZ = map(np.uint32, PRIMES)
 f32 = np.float32
 # Sum of compositing weights below which the grid knows no surface on a ray.
 MIN_KNOWN_WEIGHT = f32(1e-4)
-
-
-def _jit(function):  # type: ignore[no-untyped-def]
-    if nb is None:
-        return function
-    return nb.njit(parallel=True, fastmath=True, cache=True)(function)
-
-
-def _inline(function):  # type: ignore[no-untyped-def]
-    return function if nb is None else nb.njit(fastmath=True, inline="always")(function)
-
-
-def _intrinsic(function):  # type: ignore[no-untyped-def]
-    return function if nb is None else intrinsic(function)
+_jit = nb.njit(parallel=True, fastmath=True, cache=True)
+_inline = nb.njit(fastmath=True, inline="always")
 
 
 def encode(x, table, levels, out):  # type: ignore[no-untyped-def]
@@ -82,7 +61,7 @@ def _rows(ix, iy, iz, stride, start, mask):
     )  # fmt: skip
 
 
-@_intrinsic
+@intrinsic
 def _prefetch(typing, array, row):  # type: ignore[no-untyped-def]
     """Ask the processor for a row of an array (T, 2), and do not wait."""
 
@@ -114,7 +93,7 @@ def _fetch(table, x, n, last, size, stride, start, mask):
     iy, _ = _cell(position[1], size)
     iz, _ = _cell(position[2], size)
     r0, r1, r2, r3, r4, r5, r6, r7 = _rows(ix, iy, iz, stride, start, mask)
-    _prefetch(table, r0)
+    _prefetch(table, r0)  # type: ignore[call-arg]
     _prefetch(table, r1)
     _prefetch(table, r2)
     _prefetch(table, r3)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from scenefuse.nerf import kernels
-from scenefuse.nerf.field import Field
+from scenefuse.nerf.field import Field, kernel_module
 from scenefuse.nerf.rays import camera_rays
 
 # Interval that rays are cut into, in cells: no cell is stepped over, whatever the direction.
@@ -128,7 +128,7 @@ def march(
         uniform: share of the samples spread evenly over the ray in the hull.
         prior: expected surface; a share of 0 where there is none.
     """
-    if not (kernels.AVAILABLE and origin.device.type == "cpu"):
+    if kernel_module(origin.device)[0] is not kernels:
         t, delta, hit = march_reference(origin, direction, occupancy, jitter, uniform, prior)
     else:
         t, delta = torch.zeros(jitter.shape), torch.zeros(jitter.shape)

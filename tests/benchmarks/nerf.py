@@ -10,6 +10,7 @@ import types
 from collections.abc import Callable
 from functools import partial
 from typing import Literal
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import run
 from scenefuse.geometry.matcher import Matcher
 from scenefuse.mvs.plane_sweep import DepthMapSettings
-from scenefuse.nerf import field, kernels
+from scenefuse.nerf import field, render
 from scenefuse.nerf.field import FieldSettings, encode, encode_reference, hash_grid, kernels_on
 from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.render import UNIFORM_SHARE, Occupancy, march, no_prior
@@ -60,11 +61,9 @@ def by_both(measured: Callable[[], float]) -> dict[str, Callable[[], float]]:
     """The same with the kernels and in plain PyTorch."""
 
     def plain() -> float:
-        before = kernels.AVAILABLE, field.triton_kernels
-        kernels.AVAILABLE, field.triton_kernels = False, None
-        taken = measured()
-        kernels.AVAILABLE, field.triton_kernels = before
-        return taken
+        nothing = {"kernel_module": lambda _: (None, torch.Tensor.detach)}
+        with patch.multiple(field, **nothing), patch.multiple(render, **nothing):
+            return measured()
 
     return {"scenefuse": measured, "scenefuse in plain PyTorch": plain}
 

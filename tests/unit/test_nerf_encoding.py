@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from scenefuse.nerf import field, kernels
+from scenefuse.nerf import field
 from scenefuse.nerf.field import encode, encode_reference, hash_grid, spherical_harmonics
 
 
@@ -16,8 +16,6 @@ from scenefuse.nerf.field import encode, encode_reference, hash_grid, spherical_
 def device(request, monkeypatch):
     """Where each kind of kernels runs: the GPU's without a GPU on the CPU, in Triton's interpreter (conftest.py)."""
     if request.param == "numba":
-        if not kernels.AVAILABLE:
-            pytest.skip("Numba is not installed")
         return "cpu"
     pytest.importorskip("triton", reason="Triton is not installed: pip install -r tests/requirements.txt")
     if torch.cuda.is_available():

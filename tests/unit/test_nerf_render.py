@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from scenefuse.nerf import kernels
 from scenefuse.nerf.render import (
     Occupancy,
     RayPrior,
@@ -67,7 +66,6 @@ def test_known_density_and_prior_draw_samples_to_the_surface():
     assert int(((by_prior.t - 1.3).abs() < 0.06).sum()) >= 9
 
 
-@pytest.mark.skipif(not kernels.AVAILABLE, reason="Numba is not installed")
 def test_marching_matches_the_reference():
     rng = torch.Generator().manual_seed(3)
     occupied = torch.rand(16, 16, 16, generator=rng) > 0.6
