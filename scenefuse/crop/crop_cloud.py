@@ -27,6 +27,8 @@ FOOT_SHARE = 0.1
 MAX_RISE = float(np.tan(np.radians(20)))
 # Width of the ring around the box in which the ground is looked for, as a share of the marks' diagonal.
 RING_FRACTION = 0.5
+# Points lower than this above the ground are ground, as a share of the diagonal.
+GROUND_FRACTION = 0.015
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ def crop_cloud(
     if ground is not None:
         # Fiducials are clicked where the scene shows the object; what it stands on bounds it below.
         corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
-        low[2] = min(low[2], ground.height(corners).min() - SCORE_FRACTION * diagonal)
+        low[2] = min(low[2], ground.height(corners).min() - GROUND_FRACTION * diagonal)
     in_box, shape = ((points >= low) & (points <= high)).all(1), settings.shape
     if shape == "hull":
         try:
@@ -182,7 +184,7 @@ def ground_under(points: Array, marks: Array, low: Array, high: Array) -> tuple[
     foot, height = _foot(marks)
     limit, diagonal = foot[2] + FOOT_SHARE * height, float(np.linalg.norm(np.ptp(marks, axis=0)))
     reached = points[points[:, 2] <= limit + MAX_RISE * np.hypot(*(points - foot).T[:2])]
-    ground = fit_ground(reached, low, high, RING_FRACTION * diagonal, SCORE_FRACTION * diagonal)
+    ground = fit_ground(reached, low, high, RING_FRACTION * diagonal, GROUND_FRACTION * diagonal)
     if ground is None:
         return None, ["no ground was found around the box: nothing was removed as ground"]
     middle = (low[:2] + high[:2])[None] / 2
