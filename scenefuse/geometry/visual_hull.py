@@ -127,7 +127,7 @@ def count_silhouettes(points: NDArray[Any], outlines: Iterable[Outline], beyond:
     return counts
 
 
-def least_framing(views: Sequence[View], own: Array) -> int:
+def least_framing(views: Sequence[View], own: Array, share: float = MIN_FRAMING_SHARE) -> int:
     """How many photos must have a place in their frame for it to be the object's, whatever they show there.
 
     A share of as many as have the places that the fewest have: of a long facade, or of a statue with many photos of its
@@ -136,6 +136,7 @@ def least_framing(views: Sequence[View], own: Array) -> int:
     Args:
         views: the photos, with masks as `pixels`.
         own: (N, 3) points on the object, of any number; where they are few, the photos that have it whole count.
+        share: of these photos.
     """
     if len(own) >= MIN_OWN_POINTS:
         framed = np.zeros(len(own), dtype=np.int64)
@@ -144,7 +145,7 @@ def least_framing(views: Sequence[View], own: Array) -> int:
         usual = float(np.percentile(framed, FRAMING_PERCENTILE))
     else:
         usual = max(sum(is_whole(view.pixels) for view in views), MIN_FRAMING_SHARE * len(views))
-    return max(MIN_AGREEING, int(np.ceil(MIN_FRAMING_SHARE * usual)))
+    return max(MIN_AGREEING, int(np.ceil(share * usual)))
 
 
 def is_whole(mask: Mask) -> bool:

@@ -27,6 +27,8 @@ from scenefuse.photos.workspace import View
 FIRST_CELLS = 64
 # Share of the cube's side left free on each side of the hull, for what the masks cut off.
 MARGIN = 0.02
+# As MIN_FRAMING_SHARE, more than masks need: what few photos bound is large, and costs rays.
+MIN_FRAMING_OF_HULL = 0.3
 # The first, rough cube is wider by this share on each side than the masks' extents ask for, or the object's own points.
 ROUGH_MARGIN = 0.25
 
@@ -189,7 +191,7 @@ def visual_hull(
     """
     object_from_unit = unit_from_object.inverse()
     count = size // 4
-    quorum = least_framing([outline.view for outline in outlines], own)
+    quorum = least_framing([outline.view for outline in outlines], own, MIN_FRAMING_OF_HULL)
     cells, children = _corners(count), _corners(2)
     while True:
         points = object_from_unit.apply((cells + 0.5) / count)

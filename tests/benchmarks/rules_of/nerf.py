@@ -87,6 +87,6 @@ RULES = [
     Rule("rays beside the object halved", f"{N}.rays.OUTSIDE_SHARE", constant(0.05)),
     Rule("width of the prior halved", f"{N}.training.SURFACE_DEPTH", lambda width: width / 2),
     Rule("what is open to few photos goes", f"{N}.volume.CONFIRMING_PHOTOS", constant(0)),
-    Rule("photos that frame a cell", f"{N}.volume.MIN_FRAMING_SHARE", constant(0.0)),
+    Rule("photos that frame a cell", f"{N}.volume.MIN_FRAMING_OF_HULL", constant(0.0)),
     Rule("sparse points hide", f"{N}.train_object_nerf.sparse_depths", lambda _: lambda views: None),
 ]
