@@ -15,6 +15,8 @@ from scenefuse.core.transforms import UP, Array, rotation_between
 from scenefuse.geometry.ground import Ground, fit_ground
 from scenefuse.geometry.surface import SCORE_FRACTION
 
+# Points closer than this belong to one part, as a share of the diagonal of the fiducials' box.
+LINK_FRACTION = 0.03
 # A step is left out if less than this share of the points in the box would be left: the object is there.
 MIN_LEFT = 0.05
 # Parts with a smaller share of the points are left out.
@@ -141,7 +143,7 @@ def _without_loose_parts(
     rows = np.flatnonzero(inside)
     if not len(rows):
         return inside, []
-    link = max(2 * SCORE_FRACTION * diagonal, 3 * spacing(points[rows]))
+    link = max(LINK_FRACTION * diagonal, 3 * spacing(points[rows]))
     near = _parts_near(points[rows], marks, link, 2 * SCORE_FRACTION * diagonal)
     if not near.any():
         return inside, ["no part in the box lies near a fiducial: all of them were kept"]
@@ -233,7 +235,7 @@ def on_ground(points: Array, marks: Array, ground: Ground, in_box: NDArray[np.bo
     around = ~in_box[rows] & (z >= surface - ground.tolerance)[level]
     found = np.zeros(len(points), dtype=bool)
     if around.any():
-        part_of, counts = parts(points[rows], max(2 * SCORE_FRACTION * diagonal, 3 * spacing(points[rows])))
+        part_of, counts = parts(points[rows], max(LINK_FRACTION * diagonal, 3 * spacing(points[rows])))
         continued = np.bincount(part_of, around, len(counts)) >= MIN_PART_SHARE * around.sum()
         found[rows] = continued[part_of]
     return found & in_box

@@ -14,6 +14,7 @@ from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3
 from scenefuse.crop.crop_cloud import (
+    LINK_FRACTION,
     MIN_PART_SHARE,
     STRAY_SHARE,
     Crop,
@@ -23,7 +24,7 @@ from scenefuse.crop.crop_cloud import (
 )
 from scenefuse.geometry.depth_test import CELL_SPACINGS, SURFACE_SPACINGS, Where, depth_buffer, depth_test
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MAX_PHOTOS
-from scenefuse.geometry.surface import NORMAL_NEIGHBOURS, SCORE_FRACTION
+from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
 from scenefuse.geometry.visual_hull import MAX_BEYOND_POINTS, least_framing
 from scenefuse.marks.clicks import Clicks
 from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
@@ -80,7 +81,7 @@ class SceneClicks:
             around = points[np.argsort(np.linalg.norm(points - click, axis=1), kind="stable")[:NORMAL_NEIGHBOURS]]
             spread, axes = np.linalg.eigh(np.cov(around.T))
             if spread[0] < MAX_VARIATION * spread.sum():
-                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < 2 * SCORE_FRACTION * extent
+                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < LINK_FRACTION * extent
             found |= own
         return found
 
