@@ -61,8 +61,9 @@ def by_both(measured: Callable[[], float]) -> dict[str, Callable[[], float]]:
     """The same with the kernels and in plain PyTorch."""
 
     def plain() -> float:
-        nothing = {"kernel_module": lambda _: (None, torch.Tensor.detach)}
-        with patch.multiple(field, **nothing), patch.multiple(render, **nothing):
+        nothing = None, torch.Tensor.detach
+        patches = [patch.object(module, "kernel_module", return_value=nothing) for module in (field, render)]
+        with patches[0], patches[1]:
             return measured()
 
     return {"scenefuse": measured, "scenefuse in plain PyTorch": plain}
