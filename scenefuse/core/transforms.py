@@ -15,6 +15,8 @@ UP: Array = np.array([0.0, 0.0, 1.0])
 SD_OVER_MEDIAN = 1.4826
 # Points that fix a similarity.
 FIXING_POINTS = 3
+# Points lie along a line where they extend across it by less than this share of their extent along it (RMS).
+MIN_BREADTH = 0.01
 # What is off by this many standard deviations is an outlier: another place, another pose, or a wrong measurement.
 MAX_DEVIATIONS = 4.0
 
@@ -168,3 +170,10 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:
         right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(forward, right), forward])
+
+
+def along_a_line(points: Array) -> bool:
+    """Whether (N, 3) points lie in one place or along a line, which leaves the turn about it open."""
+    centred = points - points.mean(0)
+    least, most = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred)[1:], 0))
+    return bool(least <= MIN_BREADTH * most)

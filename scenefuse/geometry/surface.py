@@ -18,8 +18,6 @@ NORMAL_NEIGHBOURS = 16
 # Distance within which points of two surfaces agree, as a share of a diagonal; points within twice that, of which
 # either is off by it at most, belong together.
 SCORE_FRACTION = 0.02
-# Points lie along a line where they extend across it by less than this share of their extent along it (RMS).
-MIN_BREADTH = 0.01
 # Points that stand for a cloud where all would take long.
 SAMPLED_POINTS = 20_000
 
@@ -158,13 +156,6 @@ def _color_slopes(surface: Surface, neighbours: int = 20) -> Array:
     right = np.einsum("nki,nkc->nic", offset, change)
     solved = np.linalg.solve(normal_matrix + 1e-3 * scale * np.eye(3), right)
     return np.swapaxes(solved, 1, 2)
-
-
-def along_a_line(points: Array) -> bool:
-    """Whether (N, 3) points lie in one place or along a line, which leaves the turn about it open."""
-    centred = points - points.mean(0)
-    least, most = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred)[1:], 0))
-    return bool(least <= MIN_BREADTH * most)
 
 
 def ends_of(places: NDArray[np.floating[Any]]) -> Array:

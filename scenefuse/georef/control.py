@@ -14,8 +14,7 @@ import pyproj
 from scenefuse.cloud.crs import grid_name, read_crs, to_wgs84
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import comma_advice, read_lines
-from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3
-from scenefuse.geometry.surface import along_a_line
+from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3, along_a_line
 from scenefuse.marks.clicks import Click, in_photos
 from scenefuse.marks.triangulation import MAX_CLICK_MISS, intersect, model_pixel, read_ends
 from scenefuse.photos.photo_files import SUFFIXES

@@ -1,7 +1,6 @@
 """Masks of the object in every photo: by GrabCut or SAM 2 from prompts, or those that a person supplies for the
 original photos, moved into the undistorted ones; what of them `keep` keeps; all checked by their visual hull."""
 
-import ast
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from scenefuse.core.stage import (
 )
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.clicks import read_points
+from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.prompts import overlap
 from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.sam2_weights import why_unavailable
@@ -261,60 +261,6 @@ def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str], se
         "dropped": made.dropped,
         "per_photo": per_photo,
     }
-
-
-def mask_folders(keep: str) -> list[Path]:
-    """The folders of masks that an expression names.
-
-    Args:
-        keep: `object`, folders in quotes, `and`, `or`, `not` and brackets.
-
-    Raises:
-        StageError: anything else.
-    """
-    return [Path(str(node.value)) for node in ast.walk(_parsed(keep)) if isinstance(node, ast.Constant)]
-
-
-def kept_part(keep: str, own: Mask, others: dict[Path, Mask]) -> Mask:
-    """The expression's value in one photo.
-
-    Args:
-        keep: the expression.
-        own: (H, W) the mask of the object.
-        others: (H, W) of each folder; a photo without a mask shows nothing of that.
-    """
-
-    def value(node: ast.expr) -> Mask:
-        if isinstance(node, ast.BoolOp):
-            combine = np.logical_and if isinstance(node.op, ast.And) else np.logical_or
-            return combine.reduce([value(part) for part in node.values])
-        if isinstance(node, ast.UnaryOp):
-            return ~value(node.operand)
-        return others.get(Path(str(node.value)), np.zeros_like(own)) if isinstance(node, ast.Constant) else own
-
-    return value(_parsed(keep))
-
-
-def _parsed(keep: str) -> ast.expr:
-    def fits(node: ast.AST) -> bool:
-        if isinstance(node, ast.BoolOp):
-            return all(fits(part) for part in node.values)
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
-            return fits(node.operand)
-        if isinstance(node, ast.Constant):
-            return isinstance(node.value, str)
-        return isinstance(node, ast.Name) and node.id == "object"
-
-    try:
-        expression = ast.parse(keep.strip(), mode="eval").body
-    except SyntaxError:
-        expression = None
-    if expression is None or not fits(expression):
-        raise StageError(
-            f"object.masks.keep cannot be read: {keep}; write object, folders of masks in quotes, and, or, not and "
-            "brackets, for instance: object and not 'data/house/sky'"
-        )
-    return expression
 
 
 def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[str, Mask], dict[str, str]]:

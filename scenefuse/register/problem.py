@@ -9,10 +9,10 @@ from scipy.spatial import ConvexHull, QhullError
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, voxel_downsample
 from scenefuse.core.stage import StageError, quantity, read_json, value
-from scenefuse.core.transforms import UP, Array, Sim3, rotation_angle_deg, rotation_between
+from scenefuse.core.transforms import UP, Array, Sim3, along_a_line, rotation_angle_deg, rotation_between
 from scenefuse.geometry.depth_test import FreeSpace
 from scenefuse.geometry.icp import ScaleRange
-from scenefuse.geometry.surface import SCORE_FRACTION, Surface, along_a_line, prepare
+from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare
 from scenefuse.register.uncertainty import Uncertainty
 from scenefuse.sfm.gravity import UNSURE_CUES
 

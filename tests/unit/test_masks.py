@@ -19,8 +19,9 @@ from scenefuse.geometry.visual_hull import carve, mask_iou, silhouette
 from scenefuse.marks.clicks import read_points
 from scenefuse.marks.triangulation import marked_size
 from scenefuse.masks import make_masks as masks_module
+from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.grabcut import cleaned, second_trimap, stamp
-from scenefuse.masks.make_masks import MaskInputs, kept_part, make_masks, mask_folders
+from scenefuse.masks.make_masks import MaskInputs, make_masks
 from scenefuse.masks.sam2 import Sam2Transformers, check_weights, segment
 from scenefuse.masks.sam2_weights import (
     PACKAGE,

@@ -1,5 +1,5 @@
 # What masks are made from, and how.
-from scenefuse.masks.make_masks import mask_folders
+from scenefuse.masks.algebra import mask_folders
 from scenefuse.masks.sam2_weights import WEIGHTS
 
 
