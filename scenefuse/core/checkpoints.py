@@ -31,7 +31,7 @@ State = dict[str, Any]
 Terms = dict[str, float]
 
 
-def learning_rate_factor(step: int, steps: int, warmup: float, lowest: float = 0.0) -> float:
+def learning_rate_factor(step: int, steps: int, warmup: float) -> float:
     """Share of the highest learning rate at a step: a linear rise, then half a cosine.
 
     The cosine is equation (5) of Loshchilov and Hutter, SGDR (2017), without restarts.
@@ -40,12 +40,11 @@ def learning_rate_factor(step: int, steps: int, warmup: float, lowest: float = 0
         step: 0 for the first one.
         steps: of the whole training.
         warmup: steps until the highest rate, fractions allowed; less than one counts as one.
-        lowest: share that the cosine ends at.
     """
     warmup = max(1.0, warmup)
     rise = min(1.0, (step + 1) / warmup)
     done = max(0.0, (step - warmup) / max(1.0, steps - warmup))
-    return rise * (lowest + (1 - lowest) * 0.5 * (1 + math.cos(math.pi * done)))
+    return rise * 0.5 * (1 + math.cos(math.pi * done))
 
 
 def step_generator(seed: int, step: int) -> torch.Generator:

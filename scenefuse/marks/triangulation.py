@@ -25,9 +25,7 @@ MAX_CLICK_MISS = 0.005
 MAX_LENGTH_ERROR = 0.05
 
 
-def locate(
-    path: Path, model: Path, max_residual_px: float, sizes: Sizes | None = None
-) -> tuple[list[str], Array, Array]:
+def locate(path: Path, model: Path, max_residual_px: float) -> tuple[list[str], Array, Array]:
     """Marked points of either kind in the frame of a COLMAP model (scene points are taken to be in it already).
 
     Returns:
@@ -38,7 +36,7 @@ def locate(
         return marked.points, marked.positions, np.zeros(len(marked.points))
     if marked.kind == "labels":
         raise StageError(f"{path} holds labels; mark points here ('point photo x_px y_px')")
-    return triangulate(marked, read_model(model), max_residual_px, sizes)
+    return triangulate(marked, read_model(model), max_residual_px)
 
 
 def triangulate(

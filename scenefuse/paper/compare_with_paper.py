@@ -78,9 +78,6 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
         table: output, TSV: one row an object, table, variant and measure.
         section: output, HTML: the same as a section of the report page.
         seed: of the random clouds that give the null.
-
-    Raises:
-        StageError: no variant is given, or not one scene for each object.
     """
     results = Path(settings.compared_with)
     beside = _of_other_results(run, results)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Literal
 
 from scenefuse.core.job_records import KILLED, JobRecords, last_error, why_unfinished
-from scenefuse.core.stage import StageError
 from scenefuse.report.values import Fields, find, load
 
 # What of a scene or an object the user gave; `both`: photos, cameras, and a cloud in their coordinates.
@@ -132,22 +131,12 @@ class RunSummary:
 
 
 def summarise(run: RunInputs) -> RunSummary:
-    """What a run has left.
-
-    Raises:
-        StageError: no variant is given, or not one scene for each object.
-    """
-    if not run.variants:
-        raise StageError("no registration variant is given; name at least one, the one that is fused first")
-    if len(run.scene_of) != len(run.objects):
-        raise StageError(
-            f"{len(run.objects)} objects but {len(run.scene_of)} scenes are given; name the scene of each object"
-        )
+    """What a run has left."""
     given_scenes = dict(zip((folder.name for folder in run.scenes), run.given_scenes))
     scenes = {folder.name: _scene(folder, run, given_scenes.get(folder.name, "photos")) for folder in run.scenes}
     objects = []
     given_objects: Sequence[Given] = run.given_objects or ["photos"] * len(run.objects)
-    for folder, scene, given in zip(run.objects, run.scene_of, given_objects):
+    for folder, scene, given in zip(run.objects, run.scene_of, given_objects, strict=True):
         linked = bool(scene) and "cloud" not in (given, given_scenes.get(scene))
         missing = scenes[scene].missing if scene in scenes else ""
         objects.append(summarise_object(folder, run.variants, run.jobs, scene, missing, given, linked))

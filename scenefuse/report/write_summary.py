@@ -47,9 +47,6 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
     Args:
         run: see RunInputs.
         summary: output folder; other files in it are left alone.
-
-    Raises:
-        StageError: no variant is given, or not one scene for each object.
     """
     found = summarise(run)
     tables = {

@@ -100,9 +100,9 @@ def test_states_are_saved_now_and_then(tmp_path, monkeypatch):
 
 
 def test_the_learning_rate_rises_in_a_line_and_falls_in_half_a_cosine():
-    factors = [learning_rate_factor(step, steps=100, warmup=10, lowest=0.02) for step in range(101)]
+    factors = [learning_rate_factor(step, steps=100, warmup=10) for step in range(101)]
     assert factors[:10] == pytest.approx([0.1 * (step + 1) for step in range(10)])
-    assert factors[10] == 1.0 and factors[55] == pytest.approx(0.51) and factors[100] == pytest.approx(0.02)
+    assert factors[10] == 1.0 and factors[55] == pytest.approx(0.5) and factors[100] == pytest.approx(0)
     assert learning_rate_factor(0, steps=1, warmup=0.0) == 1.0
 
 
