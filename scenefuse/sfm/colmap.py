@@ -23,7 +23,7 @@ from scenefuse.core.transforms import FIXING_POINTS
 # He et al. 2026: iterations of a global bundle adjustment, and of the linear solver within one.
 ITERATIONS, LINEAR_SOLVER_ITERATIONS = 100, 200
 # Relative gain that ends an adjustment which only compares or repeats.
-ROUGH_TOLERANCE = 1e-7
+ROUGH_TOLERANCE = 1e-6
 # Observations with a larger error are dropped, as COLMAP's mapper does.
 MAX_REPROJECTION_ERROR_PX = pycolmap.IncrementalMapperOptions().filter_max_reproj_error
 # The smallest model that has a shape.

@@ -27,6 +27,9 @@ POLYNOMIALS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV",
 # Of these, a second radial term makes a richer one.
 ONE_TERM = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL")
 
+# The lens is chosen on so many points, those that most photos see, and the spread of a model is of so many.
+MAX_POINTS = 4000
+
 Held = list[tuple[int, int, Array]]
 
 
@@ -87,11 +90,12 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
     """
     kept, held = hold_out(model)
     best, beyond = lenses[0], None
-    poorer = [_errors(best.fit(kept, ROUGH_TOLERANCE), held)]
+    start = best.fit(kept, ROUGH_TOLERANCE)
+    poorer = [_errors(start, held)]
     for lens in lenses[1:]:
         if lens is RADIAL and any(camera.model_name not in ONE_TERM for camera in model.cameras.values()):
             continue
-        fitted = lens.fit(kept, ROUGH_TOLERANCE)
+        fitted = lens.fit(start, ROUGH_TOLERANCE)
         errors = _errors(fitted, held)
         gain = min(_gain(others, errors) for others in poorer)
         median = min(np.median(others) for others in poorer) if held else 0.0
@@ -99,6 +103,7 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
         is_lens = _in_bounds(fitted)
         if is_lens:
             poorer.append(errors)
+            start = fitted
         taken = better and gain >= MIN_GAIN and is_lens
         if taken:
             best, beyond = lens, None
@@ -111,9 +116,13 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
 
 
 def hold_out(model: pycolmap.Reconstruction) -> tuple[pycolmap.Reconstruction, Held]:
-    """A copy of a model without one observation of each long track, and these: point, photo, (2,) pixels."""
+    """A copy of a model with the points in most photos, without one observation of each long track, and these: point,
+    photo, (2,) pixels."""
     rng, kept, held = np.random.default_rng(0), copy.deepcopy(model), Held()
-    for point in sorted(model.point3D_ids()):
+    used = most_seen(model)
+    for point in set(model.point3D_ids()).difference(used):
+        kept.delete_point3D(point)
+    for point in sorted(used):
         track = model.points3D[point].track.elements
         if len(track) > MIN_PHOTOS:
             chosen = track[int(rng.integers(len(track)))]
@@ -121,6 +130,11 @@ def hold_out(model: pycolmap.Reconstruction) -> tuple[pycolmap.Reconstruction, H
             held.append((point, chosen.image_id, np.array(pixel)))
             kept.delete_observation(chosen.image_id, chosen.point2D_idx)
     return kept, held
+
+
+def most_seen(model: pycolmap.Reconstruction) -> list[int]:
+    """The points of a model that most photos see, these first."""
+    return sorted(model.point3D_ids(), key=lambda p: (-model.points3D[p].track.length(), p))[:MAX_POINTS]
 
 
 def enrich(camera: pycolmap.Camera, name: str) -> None:

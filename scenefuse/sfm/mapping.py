@@ -3,8 +3,9 @@
 He et al. 2026, section on the scene: bundle adjustment with 100 iterations, 200 of the linear solver, zero tolerances.
 """
 
+import contextlib
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,6 @@ from scenefuse.sfm.colmap import (
     MIN_PHOTOS,
     ROUGH_TOLERANCE,
     STRONG_PAIR,
-    adjust,
     cancellable,
     doubtful_photos,
     drop_outliers,
@@ -41,8 +41,9 @@ from scenefuse.sfm.colmap import (
 from scenefuse.sfm.given_cameras import triangulated
 from scenefuse.sfm.lens import DISTORTED, HELD, KNOWN, Lens, choose_lens
 
-# A second mapping that explains this share of the matches that the first explains is the better one: less is chance.
-MIN_EXPLAINED_AGAIN = 0.999
+# All cameras are adjusted together when there are so many times the photos or points of the last time; by COLMAP's 1.1
+# that is 60 % of a mapping, and the last adjustment ends at the same cameras.
+GLOBAL_GROWTH = 1.3
 # What to do about photos without a camera, where cameras were given and where they were not.
 GIVEN_ADVICE = (
     "Export the cameras of all photos, take the photos that have none out of the folder, or lower min_registered_share"
@@ -177,16 +178,11 @@ def _attempt(job: Job, calibrated: bool, seed: int) -> tuple[pycolmap.Reconstruc
     """The model that one seed gives, and what it is, as quantities."""
     ranked, least_matches = _mapped_first(job, calibrated, seed)
     _check_registered(ranked, job)
-    adjust(ranked[0], (KNOWN if calibrated else HELD).freedom, ROUGH_TOLERANCE)
-    drop_outliers(ranked[0])
     lens, beyond = choose_lens(ranked[0], (KNOWN,) if calibrated else DISTORTED)
-    model = lens.fit(ranked[0])
     mappings = 1
     if lens not in (HELD, KNOWN):
-        again = _mapped_again(model, job, _mapper_options(job, True, seed, least_matches))
-        second = lens.fit(again[0]) if again else None
-        if second is not None and _explained(second, job) >= MIN_EXPLAINED_AGAIN * _explained(model, job):
-            ranked, model, mappings = again, second, 2
+        ranked, mappings = _with_lens(ranked, lens, job, _mapper_options(job, True, seed, least_matches))
+    model = lens.fit(ranked[0])
     drop_outliers(model)
     summary = _describe(model, job.names, lens, beyond)
     print(
@@ -264,13 +260,29 @@ def _models(
     return sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
 
 
-def _mapped_again(
-    model: pycolmap.Reconstruction, job: Job, options: pycolmap.IncrementalPipelineOptions
-) -> list[pycolmap.Reconstruction]:
-    """The models of another mapping that begins with the calibration of this one.
+def _with_lens(
+    ranked: list[pycolmap.Reconstruction], lens: Lens, job: Job, options: pycolmap.IncrementalPipelineOptions
+) -> tuple[list[pycolmap.Reconstruction], int]:
+    """Models with the lens that the first was found to have, and how many mappings they took.
 
-    A photo that the wrong lens put at a wrong place stays there in an adjustment; a new mapping puts it right.
+    The first model's points are triangulated again, for a poorer lens splits tracks and drops matches. It may also have
+    left photos out, or put them at wrong places, where an adjustment leaves them: then photos are mapped again.
     """
+    model = lens.fit(ranked[0], ROUGH_TOLERANCE)
+    found = explained_matches(model, job.database)
+    with _calibrated(model, job) as database:
+        if model.num_reg_images() == len(job.names) and not doubtful_photos(model, found):
+            folders = job.folder, database.parent
+            return [cancellable(pycolmap.triangulate_points, model, database, *folders, options=options)], 1
+        again = _models(job, options, database)
+    if again and _explained(lens.fit(again[0], ROUGH_TOLERANCE), job) > found.total:
+        return again, 2
+    return [model, *ranked[1:]], 1
+
+
+@contextlib.contextmanager
+def _calibrated(model: pycolmap.Reconstruction, job: Job) -> Iterator[Path]:
+    """A copy of the database that holds the lenses of a model as known ones, in a folder that goes afterwards."""
     with scratch_directory(job.sparse.with_name(f"{job.sparse.name}-calibrated")) as work:
         calibrated = work / "database.db"
         shutil.copyfile(job.database, calibrated)
@@ -279,7 +291,7 @@ def _mapped_again(
                 known = pycolmap.Camera(camera.todict())
                 known.has_prior_focal_length = True
                 opened.update_camera(known)
-        return _models(job, options, calibrated)
+        yield calibrated
 
 
 def _describe(
@@ -316,6 +328,8 @@ def _mapper_options(
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
     options.ba_global_max_num_iterations = ITERATIONS
+    options.ba_global_function_tolerance = options.ba_local_function_tolerance = ROUGH_TOLERANCE
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_GROWTH
     options.min_model_size = MIN_PHOTOS
     if calibrated:
         # COLMAP leaves photos out whose lens looks like a failed adjustment: with coefficients over 1, as those of a

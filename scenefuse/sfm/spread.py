@@ -19,12 +19,12 @@ from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, v
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.photos.workspace import read_model
 from scenefuse.sfm.colmap import MIN_PHOTOS, ROUGH_TOLERANCE, adjust
-from scenefuse.sfm.lens import LENSES, Lens
+from scenefuse.sfm.lens import LENSES, Lens, most_seen
 
 # Groups of photos, each left out once.
 GROUPS = 8
-# Points kept of a model, those that most photos see; points around a place whose common motion is its motion.
-MAX_POINTS, NEAREST_POINTS = 4000, 200
+# Points around a place whose common motion is its motion.
+NEAREST_POINTS = 200
 # Points that moved more than so many times the median beside the common motion do not count for it.
 MAX_ERROR_MEDIANS = 3.0
 
@@ -98,7 +98,7 @@ def spread_of(model: pycolmap.Reconstruction, lens: Lens, beyond: Lens | None) -
         lens: what is refined.
         beyond: the next richer lens, or None.
     """
-    ids = sorted(model.point3D_ids(), key=lambda p: (-model.points3D[p].track.length(), p))[:MAX_POINTS]
+    ids = most_seen(model)
     points = np.array([model.points3D[p].xyz for p in ids]).reshape(-1, 3)
     names = sorted((model.images[i].name, i) for i in model.reg_image_ids())
     groups = min(GROUPS, len(names)) if len(names) > MIN_PHOTOS else 0

@@ -17,6 +17,7 @@ from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm import mapping
 from scenefuse.sfm.colmap import cancellable, doubtful_photos, explained_matches, require_database
 from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
+from scenefuse.sfm.lens import CENTRED, Choice
 from scenefuse.sfm.mapping import MappingSettings, map_photos
 from scenefuse.sfm.matches import (
     MAX_DISTANCE,
@@ -414,8 +415,9 @@ def test_too_few_registered_photos(tmp_path):
     assert not (tmp_path / "sparse").exists() and not (tmp_path / "sparse.json").exists()
 
 
-def small_capture(tmp_path, weak=None):
-    """A model of eight photos and its database, where the pairs of the photo of number `weak` have 20 matches each."""
+def small_capture(tmp_path, weak=None, more=()):
+    """A model of eight photos and its database, where the pairs of the photo of number `weak` have 20 matches each;
+    `more` are names of photos without matches."""
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(num_rigs=8, num_cameras_per_rig=1, num_frames_per_rig=1)
     options.num_points3D = 200
@@ -425,7 +427,7 @@ def small_capture(tmp_path, weak=None):
             geometry = database.read_two_view_geometry(*sorted((weak, other)))
             geometry.inlier_matches = geometry.inlier_matches[20 * other : 20 * other + 20]
             database.update_two_view_geometry(*sorted((weak, other)), geometry)
-    names = [i.name for i in synthetic.images.values()]
+    names = [i.name for i in synthetic.images.values()] + list(more)
     write_photos(tmp_path / "photos.json", [photo(n) for n in names], tmp_path, "photos", [])
     return synthetic
 
@@ -483,6 +485,21 @@ def test_weak_pairs_are_not_used_where_strong_ones_do(tmp_path):
     report = mapped(tmp_path)
     assert value(report, "registered") == 8 and value(report, "least_matches_of_a_pair") == 30
     assert value(report, "doubtful_photos") == {}
+
+
+@pytest.mark.parametrize(("missing", "mappings"), [((), 1), (("extra.jpg",), 3)])
+def test_photos_are_mapped_again_with_the_lens_that_was_found_where_some_are_missing(
+    tmp_path, monkeypatch, missing, mappings
+):
+    small_capture(tmp_path, more=missing)
+    calls, incremental = [], pycolmap.incremental_mapping
+    monkeypatch.setattr(mapping, "choose_lens", lambda *_: Choice(CENTRED, None))
+    monkeypatch.setattr(
+        pycolmap, "incremental_mapping", lambda *a, **options: calls.append(a) or incremental(*a, **options)
+    )
+    report = mapped(tmp_path)
+    assert (value(report, "registered"), value(report, "lens"), len(calls)) == (8, "centred", mappings)
+    assert value(report, "mean_reprojection_error_px") < 0.5
 
 
 def test_a_database_that_is_cut_short_is_named(tmp_path):
