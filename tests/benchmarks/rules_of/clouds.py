@@ -6,7 +6,7 @@ objects, of which every pose is wrong, too.
 """
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -218,7 +218,7 @@ RULES = [
     # ICP.
     Rule("ICP: no pairs beyond the rim", f"{G}.icp._without_overhang", lambda _: lambda *args: args[-1]),
     Rule("ICP: point rows beside planes", f"{G}.icp.POINT_WEIGHT", constant(0.0)),
-    Rule("ICP: colour rows", f"{R}.refinement.COLOR_WEIGHT", constant(0.0)),
+    Rule("ICP: colour rows", f"{R}.refinement.refine_planes", lambda f: partial(f, color_weight=0.0)),
     Rule("ICP: Tukey weights", f"{G}.icp._two_way_weights", _even),
     # The most likely pose.
     Rule("most likely pose", f"{R}.refinement.certified", lambda _: lambda *args: None),

@@ -54,7 +54,6 @@ RULES = [
     Rule("neighbours by the diagonal, not eight", f"{MEASURE}.MAX_NEIGHBOURS", constant(8)),
     Rule("settling", "scenefuse.fuse.modes.settle", lambda f: lambda *_: None),
     Rule("the more certain one of both poses", f"{SETTLE}.MIN_MISPLACED", constant(0.0)),
-    Rule("the scale settles where it is certain", f"{SETTLE}.MAX_SPREAD", constant(0.0)),
     Rule("photos of half the size", f"{CHECK}.halved", lambda _: lambda photos: pack([])),
     Rule("a deviation of 1.2 pixels at most", f"{CHECK}.MAX_DEVIATION_PX", constant(np.inf)),
     Rule("no other offset is better", f"{CHECK}.MAX_DROP", constant(9.0)),
