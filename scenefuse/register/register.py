@@ -20,10 +20,10 @@ from scenefuse.marks.clicks import ScenePoints, read_points
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.fine import AgreementSettings, pose_quantities, registration_metrics
-from scenefuse.register.places import likely_places
+from scenefuse.register.places import MAX_PLACES, likely_places
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, estimates, prior
 from scenefuse.register.refinement import Outcome, refine_hypotheses
-from scenefuse.register.score import DISTINCT_SHIFT
+from scenefuse.register.score import DISTINCT_SHIFT, Hypothesis
 from scenefuse.register.uncertainty import uncertainty_quantities
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
@@ -146,19 +146,39 @@ def register_clouds(
     Raises:
         StageError: too few different points, or all in one place or along one line, on either side.
     """
-    return with_agreement(register_once(obj, scene, settings, seed, ups, scales, unit), obj, scene, settings, seed)
+    found = refined(search(obj, scene, settings, seed, ups, scales), settings, unit)
+    return with_agreement(found, obj, scene, settings, seed)
 
 
-def register_once(
+@dataclass(frozen=True)
+class Search:
+    """What the coarse registration found.
+
+    Attributes:
+        problem: both clouds relative to `origins`, and what is known of the pose.
+        origins: the (3,) points subtracted from the object's and the scene's coordinates.
+        hypotheses: distinct poses, best first; none where nothing gave one.
+    """
+
+    problem: Problem
+    origins: tuple[Array, Array]
+    hypotheses: list[Hypothesis]
+
+    @property
+    def total(self) -> float:
+        """The score of the best pose; 0 where nothing gave one."""
+        return self.hypotheses[0].score.total if self.hypotheses else 0.0
+
+
+def search(
     obj: Cloud,
     scene: Cloud,
     settings: RegistrationSettings,
     seed: int,
     ups: tuple[Array, Array] | None,
     scales: ScaleRange | None,
-    unit: str,
-) -> Registration:
-    """The registration without its agreement; see `register_clouds`."""
+) -> Search:
+    """The coarse registration; arguments and errors as of `register_clouds`."""
     for name, cloud in (("the object", obj), ("the scene", scene)):
         _check_points(cloud, name)
     origins = np.floor(obj.points.mean(0)), np.floor(scene.points.mean(0))
@@ -166,10 +186,16 @@ def register_once(
     if scales is None:
         scales = prior(estimates(near_obj, near_scene, ups), settings.scale)
     problem = Problem(near_obj, near_scene, scales, Constraints(ups), seed)
-    found = find_hypotheses(problem, settings.coarse)
-    if not found:
+    return Search(problem, origins, find_hypotheses(problem, settings.coarse))
+
+
+def refined(found: Search, settings: RegistrationSettings, unit: str) -> Registration:
+    """The fine registration of what a search found, and the decision."""
+    scales, origins = found.problem.scales, found.origins
+    if not found.hypotheses:
         return Registration(False, "neither features nor gravity gave a pose", None, None, origins, scales, {})
-    outcome = refine_hypotheses(problem, [(hypothesis.pose, hypothesis.source) for hypothesis in found], settings.fine)
+    starts = [(hypothesis.pose, hypothesis.source) for hypothesis in found.hypotheses]
+    outcome = refine_hypotheses(found.problem, starts, settings.fine)
     whole = Sim3(1.0, np.eye(3), origins[1]) @ outcome.ranked[0].pose @ Sim3(1.0, np.eye(3), -origins[0])
     return Registration(outcome.decision.registered, outcome.decision.reason, whole, outcome, origins, scales, {}, unit)
 
@@ -199,8 +225,8 @@ def find_in_scene(
 ) -> tuple[Registration, Cloud, list[tuple[float, Array]]]:
     """Find where an object lies in a scene that may be thirty times as wide (method R16).
 
-    It is registered in the whole scene, as if that showed little else, and in each of `likely_places`. The best has to
-    lead over those elsewhere as over other poses.
+    It is searched in the whole scene, as if that showed little else, and in each of `likely_places`; the best coarse
+    poses are refined. The best has to lead over those elsewhere as over other poses.
 
     Args:
         obj, scene, settings, seed, ups, scales, unit: as of `register_clouds`.
@@ -213,14 +239,18 @@ def find_in_scene(
     Raises:
         StageError: as of `register_clouds`.
     """
-    tried = [(register_once(obj, scene, settings, seed, ups, scales, unit), scene)]
-    for rows in likely_places(obj, scene, up_in_scene, settings.crop, seed, settings.coarse.keep):
+    searched = [(search(obj, scene, settings, seed, ups, scales), scene)]
+    for rows in likely_places(obj, scene, up_in_scene, settings.crop, seed, MAX_PLACES):
         with contextlib.suppress(StageError):  # too few different points there
-            tried.append((register_once(obj, scene[rows], settings, seed, ups, scales, unit), scene[rows]))
+            searched.append((search(obj, scene[rows], settings, seed, ups, scales), scene[rows]))
+    # The refinement of a pose does not catch up with one that is twice as good.
+    least = max(there.total for there, _ in searched) / 2
+    best = sorted((one for one in searched if one[0].total >= least), key=lambda one: -one[0].total)
+    tried = [(refined(there, settings, unit), part) for there, part in best[: settings.coarse.keep]]
     found, part = max(tried, key=lambda one: (one[0].registered, one[0].total))
     if len(tried) > 1:
         found = _unless_elsewhere(found, [other for other, _ in tried], obj, settings.fine)
-    ranked = sorted(tried[1:], key=lambda one: -one[0].total)
+    ranked = sorted((one for one in tried if one[1] is not scene), key=lambda one: -one[0].total)
     places = [(one.total, np.stack([there.points.min(0), there.points.max(0)])) for one, there in ranked]
     return with_agreement(found, obj, part, settings, seed), part, places
 

@@ -123,7 +123,7 @@ def register(
             given.object, given.scene.part, settings, seed, ups=given.ups, up_in_scene=known.ups()[1], scales=scales,
             unit=unit,
         )  # fmt: skip
-        searched = f"{given.searched}, and {len(places)} places in it that look like the object"
+        searched = f"{given.searched}, and the parts of it that look like the object"
         given = replace(given, scene=replace(given.scene, part=part), searched=searched)
     else:
         found = register_clouds(given.object, given.scene.part, settings, seed, ups=given.ups, scales=scales, unit=unit)

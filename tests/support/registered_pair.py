@@ -1,5 +1,7 @@
 """A planted registration that needs no search: for tests of what is read and written around it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from scenefuse.cloud.clouds import Cloud
@@ -20,13 +22,17 @@ def registered_at_once(monkeypatch, pose: Sim3, registered: bool = True) -> list
     """
     searched = list[tuple[Cloud, Cloud]]()
 
-    def found(obj: Cloud, scene: Cloud, *known: object) -> Registration:
+    def search(obj: Cloud, scene: Cloud, *known: object) -> SimpleNamespace:
         searched.append((obj, scene))
-        origins, unit = (np.zeros(3), np.zeros(3)), str(known[-1])
+        return SimpleNamespace(total=1.0)
+
+    def refined(there: object, settings: object, unit: str) -> Registration:
+        origins = np.zeros(3), np.zeros(3)
         best = Hypothesis(pose, "planted", Score(1.0, 1.0, 1.0, None, None, 0.0))
         outcome = Outcome([best], Decision(registered, "planted", "geometry", 1.0, None, None), None)
         return Registration(registered, "planted", pose, outcome, origins, ScaleRange(pose.scale, 0.0), {}, unit)
 
-    monkeypatch.setattr(register, "register_once", found)
+    monkeypatch.setattr(register, "search", search)
+    monkeypatch.setattr(register, "refined", refined)
     monkeypatch.setattr(register, "likely_places", lambda *known: [])
     return searched
