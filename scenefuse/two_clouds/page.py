@@ -1,15 +1,21 @@
-"""The page of a registration of two clouds: decision, 3D view before and after, picture, numbers, matrix."""
+"""The pages of a registration of two clouds: its decision, numbers and 3D view; of a refusal, one to draw a box in."""
 
+import json
 from html import escape
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
+from scenefuse.cloud.clouds import Cloud, voxel_downsample
 from scenefuse.core.stage import atomic_file, value
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
-from scenefuse.report.page import document, figure, view_section
-from scenefuse.report.values import flatten, number
+from scenefuse.photos.sheets import TILE_PX
+from scenefuse.report.page import document, figure, view_section, webp
+from scenefuse.report.render import Camera, point_radii, render
+from scenefuse.report.values import asset, flatten, number
 from scenefuse.report.view import REACH, View, view_of, within
 from scenefuse.two_clouds.complete import Completed
 
@@ -65,6 +71,58 @@ def write_page(
         parts.append(f"<h2>x_scene = M x_object{refused}</h2><pre>{rows}</pre>")
     with atomic_file(page) as temporary:
         temporary.write_text(document(title, parts, done is not None), encoding="utf-8")
+
+
+def write_box_page(page: Path, scene: Cloud, up: Array | None, boxes: list[Array], command: str) -> None:
+    """Write a page that shows a scene along an axis and gives the command with the --crop-box that is drawn in it.
+
+    Args:
+        page: output, one HTML file.
+        scene: to draw in, in its file's coordinates.
+        up: (3,) unit up direction there. The scene is seen along the axis that is nearest to it, else along the one in
+            which it reaches least.
+        boxes: (2, 3) corners of places to propose.
+        command: to which the box is added.
+    """
+    low, high = scene.points.min(0), scene.points.max(0)
+    along = int(np.argmin(high - low) if up is None else np.abs(up).argmax())
+    axes = [axis for axis in range(3) if axis != along]
+    toward = np.zeros(3)
+    toward[along] = 1.0 if up is None or up[along] > 0 else -1.0
+    upward = np.eye(3)[axes[1]]
+    right = np.cross(upward, toward)
+    # Free space around it, so that a rectangle can go around what lies at its border.
+    size_px = 3 * TILE_PX[0]
+    pixel = 1.1 * float(max((high - low)[axes].max(), 1e-9)) / size_px
+    size = np.ceil((high - low)[axes] / pixel + 0.1 * size_px).astype(int)
+    middle = (low + high) / 2
+    away = middle + ((high - low)[along] + pixel) * toward
+    camera = Camera(np.array([right, -upward, -toward]), away, 1 / pixel, *map(int, size), orthographic=True)
+    thinned = voxel_downsample(scene, pixel, mean_colors=True)
+    picture = render(thinned, camera, point_radii(thinned.points))
+    steps = np.array([right[axes[0]] * pixel, -pixel])
+    decimals = max(0, int(np.ceil(-np.log10(pixel))))
+    about = {
+        "axes": axes,
+        "corner": (middle[axes] - steps * size / 2).tolist(),
+        "step": steps.tolist(),
+        "heights": [float(low[along]) - pixel, float(high[along]) + pixel],
+        "decimals": decimals,
+        "places": [box.tolist() for box in boxes],
+        "command": command,
+    }
+    buttons = [f'<button type="button">Place {k + 1}</button>' for k in range(len(boxes))]
+    body = Template(asset("box.html")).substitute(
+        title="Where is the object?",
+        axis="xyz"[along],
+        places=f"Places that look like it: {''.join(buttons)}" if boxes else "",
+        picture=webp(Image.fromarray(picture)),
+        width=size[0],
+        height=size[1],
+        about=json.dumps(about).replace("</", "<\\/"),
+    )
+    with atomic_file(page) as temporary:
+        temporary.write_text(document("Where is the object?", [body], False), encoding="utf-8")
 
 
 def view_of_scene(name: str, done: Completed, up: Array | None, unit: str) -> View:

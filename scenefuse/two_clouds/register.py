@@ -1,6 +1,7 @@
 """Two files in; a decision, a transform, a picture and, if asked for, the completed scene out."""
 
 import os
+import shlex
 import time
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -35,16 +36,18 @@ from scenefuse.register.register import (
 )
 from scenefuse.report.view import REACH
 from scenefuse.two_clouds.complete import complete, fusion_settings, write_files
-from scenefuse.two_clouds.page import write_page
+from scenefuse.two_clouds.page import write_box_page, write_page
 
 NOTHING = Known()
 # How many times as large as the scene's part that shows it an object may be, and as that part's spacing it has to be.
 MAX_SIZE_RATIO = 10.0
 # Points of the part of a scene in which an object is searched: of many more, some are left out.
 MAX_SEARCHED_POINTS = 1 << 22
+# What a refusal ends in.
+BOX_PAGE = "crop_box.html"
 OUTPUTS = (
     *("transform.json", "transform.txt", "picture.png", "report.html", "completed.ply", "completed.laz"),
-    *("completed.json", "object_in_scene.ply", "object_in_scene.laz", "object_in_scene.las"),
+    *(BOX_PAGE, "completed.json", "object_in_scene.ply", "object_in_scene.laz", "object_in_scene.las"),
 )
 """All that a run may write; what an earlier one left of it is removed first."""
 
@@ -118,10 +121,10 @@ def register(
     crs = las_crs(scene)
     unit = "scene units" if crs is None else unit_and_name(crs)[0]
     places: list[tuple[float, Array]] = []
-    if known.fiducials is None and known.crop_box is None:
+    whole = given.scene.part if known.fiducials is None and known.crop_box is None else None
+    if whole is not None:
         found, part, places = find_in_scene(
-            given.object, given.scene.part, settings, seed, ups=given.ups, up_in_scene=known.ups()[1], scales=scales,
-            unit=unit,
+            given.object, whole, settings, seed, ups=given.ups, up_in_scene=known.ups()[1], scales=scales, unit=unit
         )  # fmt: skip
         searched = f"{given.searched}, and the parts of it that look like the object"
         given = replace(given, scene=replace(given.scene, part=part), searched=searched)
@@ -139,7 +142,8 @@ def register(
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
     if not found.registered:
-        content["next"] = quantity(_advice(known, len(places)), "")
+        advice = f"draw a box around the object in {out / BOX_PAGE}, which gives the next command"
+        content["next"] = quantity(f"{advice}; {ROOT}/docs/register.md lists causes", "")
         content["places"] = quantity([{"score": score, "crop_box": box.ravel()} for score, box in places], unit)
     print("\n".join(summary(found, given.searched, given.ups, evidence)), flush=True)
     if not found.registered:
@@ -147,6 +151,11 @@ def register(
             print(f"place      score {score:.2f}  --crop-box {_corners(box)}", flush=True)
         print(f"next       {value(content, 'next')}", flush=True)
     written = _write(out, format, given, found, scene, seed)
+    if not found.registered:
+        written.append(out / BOX_PAGE)
+        shown = CloudFile.of(scene, most=MAX_SEARCHED_POINTS).part if whole is None else whole
+        command = _command(object, scene, out, bool(fuse), known, config)
+        write_box_page(written[-1], shown, known.ups()[1], [box for _, box in places], command)
     if fuse:
         written += _fuse(out, given, found, content, known, config)
     # Last, so that it says registered only where all is written.
@@ -156,13 +165,14 @@ def register(
     return ExitStatus.REGISTERED if found.registered else ExitStatus.UNREGISTERED
 
 
-def _advice(known: Known, places: int) -> str:
-    """What a user can do about a refusal."""
-    if known.fiducials is None and known.crop_box is None:
-        one = "give the --crop-box of the place above that is right, or " if places else ""
-        further = f"{ROOT}/docs/register.md lists further causes"
-        return f"{one}mark the object in the scene by --fiducials or --crop-box; {further}"
-    return f"{ROOT}/docs/register.md lists causes and what to do about each"
+def _command(object: Path, scene: Path, out: Path, fuse: bool, known: Known, config: Path | None) -> str:
+    """What was typed, without what marked a part of the scene."""
+    words = ["scenefuse", "register", "--object", object, "--scene", scene, "--out", out, *["--fuse"] * fuse]
+    words += [] if config is None else ["--config", config]
+    for name in ("up_object", "up_scene", "scale", "scale_range"):
+        if (given := getattr(known, name)) is not None:
+            words += [f"--{name.replace('_', '-')}", *np.atleast_1d(given)]
+    return shlex.join(map(str, words))
 
 
 def _corners(box: Array) -> str:

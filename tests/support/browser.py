@@ -111,9 +111,10 @@ def click(browser: Browser, element, x: float, y: float) -> None:
     _point(browser, element, [(x, y)], "mouse")
 
 
-def touch(browser: Browser, element, path: list[tuple[float, float]]) -> None:
-    """Put a finger down, move it along a path of pixels from an element's upper left corner, and lift it."""
-    _point(browser, element, path, "touch")
+def touch(browser: Browser, element, path: list[tuple[float, float]], kind: str = "touch") -> None:
+    """Put a finger (or the mouse) down, move it along a path of pixels from an element's upper left corner, and lift
+    it."""
+    _point(browser, element, path, kind)
 
 
 def _point(browser: Browser, element, path, kind: str) -> None:

@@ -112,10 +112,10 @@ def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_pa
     done = subprocess.run(list(map(str, command)), cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 3, done.stderr
     assert done.stdout.startswith("unregistered: ")
-    assert "mark the object in the scene by --fiducials or --crop-box" in done.stdout
+    assert "draw a box around the object in out/crop_box.html" in done.stdout
     content = read_json(out / "transform.json")
     assert value(content, "status") == "unregistered" and value(content, "reason") in done.stdout
-    assert sorted(p.name for p in out.iterdir()) == ["picture.png", "transform.json"]
+    assert sorted(p.name for p in out.iterdir()) == ["crop_box.html", "picture.png", "transform.json"]
 
 
 def test_two_runs_agree_bit_for_bit_and_origins_far_away_change_nothing(house):

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import sys
 from dataclasses import replace
 
@@ -9,14 +10,16 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
+import tyro
 from laspy.vlrs.vlrlist import VLRList
 from scipy.spatial import cKDTree
+from support.browser import chromium, touch
 from support.cloud_files import UTM
 from support.planted import plant
 from support.registered_pair import registered_at_once
 
 from scenefuse.cloud.cloud_file import EVERYWHERE, CloudFile
-from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing, write_cloud
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError, quantity, read_json, value
 from scenefuse.core.transforms import Sim3
@@ -25,7 +28,7 @@ from scenefuse.fuse.modes import FusionSettings
 from scenefuse.register import register as register_module
 from scenefuse.register.register import Known
 from scenefuse.two_clouds.complete import append_to_las, complete, write_files
-from scenefuse.two_clouds.page import write_page
+from scenefuse.two_clouds.page import write_box_page, write_page
 from scenefuse.two_clouds.register import register
 
 FILL = FusionSettings(mode="fill")
@@ -321,7 +324,7 @@ def test_a_refused_pose_leaves_no_completed_scene_and_nothing_of_an_earlier_run(
     write_cloud(tmp_path / "house.ply", house.object)
     write_cloud(tmp_path / "yard.ply", house.scene)
     assert register(object=tmp_path / "house.ply", scene=tmp_path / "yard.ply", out=out, fuse=True) == 3
-    assert sorted(path.name for path in out.iterdir()) == ["picture.png", "report.html", "transform.json"]
+    assert sorted(p.name for p in out.iterdir()) == ["crop_box.html", "picture.png", "report.html", "transform.json"]
     page = (out / "report.html").read_text()
     assert "unregistered" in page and "The pose was refused" in page
 
@@ -338,11 +341,79 @@ def test_a_refusal_ends_in_places_whose_boxes_can_be_pasted(tmp_path, house, mon
     box = tuple(map(float, re.search(r"^place +score 0\.00  --crop-box (.*)$", said, re.MULTILINE)[1].split()))
     points = house.scene.points[rows]
     np.testing.assert_allclose(box, [*points.min(0), *points.max(0)], atol=1e-3 * np.ptp(points, axis=0).max())
-    assert "give the --crop-box of the place above that is right, or mark the object" in said
+    assert f"draw a box around the object in {tmp_path / 'out/crop_box.html'}" in said
     written = value(read_json(tmp_path / "out/transform.json"), "places")
     assert len(written) == 1 and len(written[0]["crop_box"]) == 6
     assert register(**known, known=Known(crop_box=box)) == 3
     assert "place " not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("phone", [False, True])
+def test_the_box_drawn_in_the_page_of_a_refusal_holds_the_object_and_its_command_finds_it(tmp_path, house, phone):
+    others = plant("sculpture", 7, ground=False, noise=0.005, density_ratio=1.0).scene
+    low, high = house.scene.points.min(0), house.scene.points.max(0)
+    shift = UTM + [3 * (high - low)[0], -2 * (high - low)[1], 0]
+    write_survey(
+        tmp_path / "yard.laz",
+        concatenate(
+            [
+                Cloud(house.scene.points + UTM, None, house.scene.colors),
+                Cloud(others.points + shift, None, others.colors),
+            ]
+        ),
+    )
+    write_cloud(tmp_path / "house.ply", house.object)
+    known = {"object": tmp_path / "house.ply", "scene": tmp_path / "yard.laz", "out": tmp_path / "out"}
+    with pytest.MonkeyPatch.context() as patch:
+        registered_at_once(patch, house.scene_from_object, registered=False)
+        patch.setattr(register_module, "likely_places", lambda *known: [np.arange(len(house.scene))])
+        assert register(**known, known=Known(up_scene=(0, 0, 1))) == 3
+    with chromium("--window-size=1400,900", phone=phone) as window:
+        window.open(tmp_path / "out/crop_box.html")
+        picture = window.find(".map svg")
+        middle, reach, size = (low + high) / 2 + UTM, 0.55 * (high - low), picture.size
+        pixel = window.value(
+            "return about.axes.map((axis, k) => (given[0][axis] - about.corner[k]) / about.step[k]);", middle.tolist()
+        )
+        shown = size["width"] / window.value("return map.viewBox.baseVal.width;")
+        across = shown * np.array(reach[:2]) / window.value("return Math.abs(about.step[0]);")
+        path = [shown * np.array(pixel) + side * across for side in (-1, -0.5, 0, 0.5, 1)]
+        touch(window, picture, [tuple(place) for place in path], "touch" if phone else "mouse")
+        said = window.find("#command").text
+        assert window.value("return document.documentElement.scrollWidth <= innerWidth;")
+        window.find(".places button").click()
+        place = np.array(window.find("#command").text.split("--crop-box ")[1].split(), np.float64)
+        assert window.complaints() == []
+    np.testing.assert_allclose(place, [*(low + UTM), *(high + UTM)], atol=0.05)
+    words = shlex.split(said)
+    box = np.array(words[words.index("--crop-box") + 1 :], np.float64)
+    np.testing.assert_allclose(box[[0, 1, 3, 4]], [*(middle - reach)[:2], *(middle + reach)[:2]], atol=0.3)
+    assert words[:2] == ["scenefuse", "register"] and words[words.index("--up-scene") + 1] == "0"
+    if not phone:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+            assert tyro.cli(register, args=words[2:]) == 0
+
+
+@pytest.mark.parametrize(
+    ("points", "up", "axis"),
+    [
+        ([[0.0, 0, 0], [5, 1, 9], [3, 0.5, 2]], None, "y"),
+        ([[0.0, 0, 0], [5, 1, 9], [3, 0.5, 2]], (0, 0, -1), "z"),
+        ([[7.0, 7, 7]], None, "x"),
+    ],
+)
+def test_any_scene_has_a_page_to_draw_in(tmp_path, points, up, axis):
+    scene = Cloud(np.array(points))
+    write_box_page(tmp_path / "page.html", scene, None if up is None else np.array(up, np.float64), [], "do")
+    text = (tmp_path / "page.html").read_text()
+    about = json.loads(re.search(r'id="about">(.*?)</script>', text)[1])
+    assert f"along its {axis} axis" in text and "xyz".index(axis) not in about["axes"]
+    # Seen from below, the picture is mirrored: x grows to the left.
+    assert (about["step"][0] < 0) == (up is not None) or axis == "y"
+    for k, side in enumerate(about["axes"]):
+        pixels = (scene.points[:, side] - about["corner"][k]) / about["step"][k]
+        assert (pixels >= 0).all() and (pixels <= 1300).all()
 
 
 def test_noise_of_a_laz_is_not_searched_and_stays_in_the_completed_laz_alone(tmp_path, house, monkeypatch, capsys):
