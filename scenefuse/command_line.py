@@ -106,6 +106,8 @@ def _export() -> None:
     )
     parser.add_argument("--what", nargs="+", choices=EXPORTS, default=list(EXPORTS), help="default: all of them")
     parser.add_argument("--object", nargs="+", dest="names", metavar="NAME", help="default: all that are finished")
+    facade = "three points of a facade of one object, to draw it as well"
+    parser.add_argument("--facade", nargs=9, type=float, metavar=("X", "Y", "Z") * 3, help=facade)
     words, others = parser.parse_known_args(sys.argv[1:])
     finished = sorted(path.parent.name for path in Path().glob("results/objects/*/fused.ply"))
     missing = [name for name in words.names or () if name not in finished]
@@ -113,6 +115,10 @@ def _export() -> None:
         which = f"object '{missing[0]}' has" if missing else "no object has"
         sys.exit(f"error: {which} a results/objects/NAME/fused.ply here; run the workflow first (scenefuse run)")
     names = sorted(words.names or finished)
+    if words.facade:
+        if len(names) > 1:
+            sys.exit("error: --facade is of one object; name it by --object")
+        Path(f"results/objects/{names[0]}/facade.txt").write_text(" ".join(map(str, words.facade)))
     scenes = sorted(path.parent.name for path in Path().glob("results/scenes/*/dense.ply"))
     # Given clouds have no cameras, and a scene that was not completed has no tiles.
     needed = {"cameras": "results/*/*/undistorted", "tiles": "results/scenes/*/completed.ply", "pdf": str(REPORT)}

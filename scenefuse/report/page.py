@@ -86,12 +86,13 @@ def view_section(key: str, name: str, view: View, mesh: ViewMesh | None = None) 
         middle = (view.cloud.points.min(0) + view.cloud.points.max(0)) / 2
         about["surface"], triangles = encode_mesh(mesh, middle, deviations)
         own = _mesh_modes(mesh, [mode for mode in modes if mode["name"] == "deviation"])
-        about["surface"]["modes"] = own
+        about["surface"] |= {"modes": own, "name": name}
         buttons |= {mode["name"]: mode["button"] for mode in own}
         picture = "" if mesh.picture is None else webp(mesh.picture)
     return Template(asset("view.html")).substitute(
         name=escape(name),
         # An object by itself has no before and after.
+        no_surface=" hidden" if mesh is None else "",
         one_cloud="" if (view.cloud.fields["shown"] != Shown.BOTH).any() else " hidden",
         whens=_choice(f"when-{key}", whens, "after"),
         colours=_choice(f"colour-{key}", buttons, modes[0]["name"]),

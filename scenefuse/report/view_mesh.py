@@ -32,6 +32,7 @@ class ViewMesh:
         uv: (V, 2) places in the picture, from its upper left, 0..1; None without a picture.
         picture: of the photos, small enough for a page.
         all_faces: how many the surface has of which this is a simplification.
+        scene_from_view: (4, 4), to the scene's frame.
     """
 
     vertices: Cloud
@@ -39,6 +40,7 @@ class ViewMesh:
     uv: Array | None
     picture: Image.Image | None
     all_faces: int
+    scene_from_view: Array
 
 
 def read_mesh(folder: Path, unit: str) -> ViewMesh | None:
@@ -56,7 +58,8 @@ def read_mesh(folder: Path, unit: str) -> ViewMesh | None:
     painted = read_painted(folder / "surface.glb")
     if painted is None:
         small = simplified(whole)
-        return ViewMesh(small.vertices.transformed(level), small.faces, None, None, len(whole.faces))
+        vertices = small.vertices.transformed(level)
+        return ViewMesh(vertices, small.faces, None, None, len(whole.faces), level.inverse().matrix)
     points = painted.points / metres_per_unit(unit)
     nearest = cKDTree(whole.vertices.points).query(points, workers=threads())[1]
     fields = {"class": np.zeros(len(points), np.uint8), "deviation": whole.vertices.fields["deviation"][nearest]}
@@ -66,7 +69,7 @@ def read_mesh(folder: Path, unit: str) -> ViewMesh | None:
     picture = Image.fromarray(painted.picture)
     # As large as the widest pictures of the page.
     picture.thumbnail((3 * TILE_PX[0], 3 * TILE_PX[0]))
-    return ViewMesh(vertices, painted.faces, painted.uv, picture, len(whole.faces))
+    return ViewMesh(vertices, painted.faces, painted.uv, picture, len(whole.faces), level.inverse().matrix)
 
 
 def encode_mesh(mesh: ViewMesh, middle: Array, deviations: list[float] | None) -> tuple[dict[str, Any], bytes]:
@@ -100,6 +103,7 @@ def encode_mesh(mesh: ViewMesh, middle: Array, deviations: list[float] | None) -
         "vertices": len(vertices),
         "faces": len(mesh.faces),
         "all_faces": mesh.all_faces,
+        "scene_from_view": (mesh.scene_from_view @ Sim3(1.0, np.eye(3), middle).matrix)[:3].tolist(),
         "step": step.tolist(),
         "corner": (low - middle).tolist(),
         "planes": list(planes),

@@ -16,8 +16,8 @@ from rasterio.enums import ColorInterp
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from scenefuse.core.stage import atomic_directory, quantity, read_json, threads, write_json
-from scenefuse.core.transforms import Array
+from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, threads, write_json
+from scenefuse.core.transforms import UP, Array
 from scenefuse.fuse.compare import MARGIN
 from scenefuse.fuse.measure import SUPPORT
 from scenefuse.photos.geodesy import length_unit, scene_frame
@@ -124,18 +124,48 @@ def wall_turn(surface: Surface) -> float:
     return float(np.angle(mean)) / 4 if abs(mean) >= SUPPORT else 0.0
 
 
-def draw_surface(*, name: str, surface: Path, glb: Path, georeference_json: Path | None = None, folder: Path) -> None:
-    """Draw an object from above and from four sides.
+def facade_axes(surface: Surface, points: Array) -> Array:
+    """Axes (3, 3) of a drawing of the plane through three points (3, 3), seen from where the surface faces.
+
+    Raises:
+        StageError: the points lie in a line.
+    """
+    normal = np.cross(points[1] - points[0], points[2] - points[0])
+    if np.linalg.norm(normal) <= MARGIN * np.ptp(points, axis=0).max() ** 2:
+        raise StageError("the three points of the facade lie in a line; click three of its corners")
+    toward, vertices = normal / np.linalg.norm(normal), surface.vertices
+    beside = np.abs((vertices.points - points[0]) @ toward) <= MARGIN * vertices.diagonal
+    assert vertices.normals is not None
+    toward *= -1.0 if (vertices.normals[beside] @ toward).sum() < 0 else 1.0
+    # Up is y where the plane is level.
+    upright = UP if abs(toward @ UP) < 1 - MARGIN else np.array([0.0, 1, 0])
+    right = np.cross(upright, toward)
+    right /= np.linalg.norm(right)
+    return np.array([right, np.cross(toward, right), toward])
+
+
+def draw_surface(
+    *,
+    name: str,
+    surface: Path,
+    glb: Path,
+    georeference_json: Path | None = None,
+    facade: tuple[float, ...] = (),
+    folder: Path,
+) -> None:
+    """Draw an object from above and from four sides, and a facade of it.
 
     Of each drawing NAME: NAME.png, a sheet with frame and scale bar, bridged parts tinted; NAME.tif, the picture;
     NAME_height.tif, NAME_class.tif, NAME_deviation.tif. `above` is a GeoTIFF in the scene's CRS where it has one.
-    Elevations are turned to the object's walls. drawings.pdf has all sheets, A3, to the scale that they say.
+    Elevations are turned to the object's walls; heights of `facade` are distances from its plane. drawings.pdf has all
+    sheets, A3, to the scale that they say.
 
     Args:
         name: of the object.
         surface: PLY of `make_surface`.
         glb: the same with a picture from photos, or without.
         georeference_json: JSON of the scene.
+        facade: x y z of three points of a wall or a roof, in the scene's frame; none for no such drawing.
         folder: output, with drawings.json: pixel, scale, direction of each.
     """
     whole, painted = read_surface(surface), read_painted(glb)
@@ -148,13 +178,13 @@ def draw_surface(*, name: str, surface: Path, glb: Path, georeference_json: Path
     frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
     with atomic_directory(folder) as output:
         pages = PdfPages(output / "drawings.pdf", metadata={"CreationDate": None})
-        for side, (right, up) in SIDES.items() if len(whole.faces) else ():
-            axes = np.array([right, up, np.cross(right, up)], dtype=np.float64)
+        for side, axes in _axes_of(whole, turn, facade).items() if len(whole.faces) else ():
             drawn, shown, crs, shift = whole, painted, None, np.zeros(3)
             if side != "above":
-                c, s = np.cos(turn), np.sin(turn)
-                axes = axes @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-                if frame is not None:
+                if side == "facade":
+                    shift[2] = -axes[2] @ np.array(facade[:3])
+                # Of an inclined plane, up are no heights.
+                if frame is not None and axes[1] @ UP > 1 - MARGIN:
                     middle = whole.vertices.points.mean(0, keepdims=True)
                     shift[1] = (frame.in_crs(middle) - middle)[0, 2]
             elif frame is not None:
@@ -168,7 +198,8 @@ def draw_surface(*, name: str, surface: Path, glb: Path, georeference_json: Path
                 "" if side == "above" else f", looking {np.degrees(np.arctan2(-axes[2, 0], -axes[2, 1])) % 360:.1f}°"
             )
             scale = _scale(drawing, metres)
-            title = f"{name} from {'above' if side == 'above' else 'the ' + side}{azimuth}"
+            where = {"above": "from above", "facade": "facade"}.get(side, f"from the {side}")
+            title = f"{name} {where}{azimuth}"
             title += f"; 1:{scale}" if unit != "scene units" else ""
             left = drawing.left + shift[0] if side == "above" else 0.0
             figure = _sheet(drawing, title, unit, metres / scale, (left, drawing.top + shift[1]))
@@ -180,6 +211,15 @@ def draw_surface(*, name: str, surface: Path, glb: Path, georeference_json: Path
         pages.close()
         report |= {"wall_turn": quantity(float(np.degrees(turn)), "deg"), "crs": quantity(frame and frame.crs, "")}
         write_json(output / "drawings.json", report)
+
+
+def _axes_of(surface: Surface, turn: float, facade: tuple[float, ...]) -> dict[str, Array]:
+    """Axes (3, 3) of all drawings: right, up, towards the viewer."""
+    c, s = np.cos(turn), np.sin(turn)
+    turned = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    axes = {side: np.array([right, up, np.cross(right, up)], np.float64) for side, (right, up) in SIDES.items()}
+    axes = {side: own if side == "above" else own @ turned for side, own in axes.items()}
+    return axes | ({"facade": facade_axes(surface, np.reshape(facade, (3, 3)))} if facade else {})
 
 
 def pixel_of(surface: Surface, painted: Painted | None) -> float:

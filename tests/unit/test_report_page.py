@@ -215,6 +215,19 @@ def test_the_surface_is_shown_with_photos_class_and_deviation_beside_the_points(
     assert classes[..., 1].mean() > photos[..., 1].mean()
     choose(browser, "Std. deviation")
     assert changed(browser.picture(STAGE), classes) > 0.1
+    # Three clicks give the command that draws a facade, with points of the cloud in the scene's frame.
+    choose(browser, "Draw a facade")
+    stage = browser.find(STAGE)
+    width, height = stage.size["width"], stage.size["height"]
+    for right, down in ((0.4, 0.45), (0.55, 0.45), (0.5, 0.6)):
+        click(browser, stage, right * width, down * height)
+    words = browser.find(f"{SECTION} .command").text.split()
+    assert words[:6] == ["scenefuse", "export", "--what", "drawings", "--object", "house"]
+    clicked = np.array(words[7:], np.float64).reshape(3, 3) @ turned.T
+    cloud = np.concatenate([before.points, added.points])
+    assert np.linalg.norm(cloud[:, None] - clicked, axis=2).min(0).max() < 1e-3 and len(np.unique(clicked, axis=0)) == 3
+    choose(browser, "Draw a facade")
+    assert not browser.find(f"{SECTION} .command").is_displayed()
     choose(browser, "Before")
     assert "441 points" in browser.find(legend).text and browser.complaints() == []
 

@@ -28,7 +28,7 @@ from scenefuse.report.facts import surface_facts
 from scenefuse.report.write_pdf import write_pdf
 from scenefuse.surface import tiles
 from scenefuse.surface.cameras import export_cameras
-from scenefuse.surface.drawings import NOTHING, SIDES, draw, draw_surface, wall_turn
+from scenefuse.surface.drawings import NOTHING, SIDES, draw, draw_surface, facade_axes, wall_turn
 from scenefuse.surface.gltf import Painted, write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
 from scenefuse.surface.mesh import FaceClass, make_mesh
@@ -253,6 +253,27 @@ def test_an_elevation_has_the_scale_that_it_says(coarse, tmp_path: Path):
     assert (tmp_path / "d/drawings.pdf").read_bytes()[:4] == b"%PDF"
 
 
+def test_a_facade_is_drawn_of_the_plane_through_three_points_from_outside(closed, tmp_path: Path):
+    """A plane that cuts the ball half a radius in front of its middle, towards east and a little north."""
+    toward = Rotation.from_euler("z", 30, degrees=True).apply([1.0, 0, 0])
+    corners = 0.5 * toward + np.array([[0, 0, -0.3], [0, 0, 0.3], np.cross([0, 0, 0.4], toward)])
+    write_surface(tmp_path / "surface.ply", closed)
+    write_glb(tmp_path / "surface.glb", closed, {})
+    files = {"surface": tmp_path / "surface.ply", "glb": tmp_path / "surface.glb", "folder": tmp_path / "d"}
+    for order in ([0, 1, 2], [1, 0, 2]):
+        np.testing.assert_allclose(
+            facade_axes(closed, corners[order]), [np.cross([0, 0, 1], toward), [0, 0, 1], toward], atol=1e-9
+        )
+    draw_surface(name="ball", facade=tuple(corners.ravel()), **files)
+    heights = rasterio.open(tmp_path / "d/facade_height.tif").read(1)
+    # Its front stands half a radius before the plane, and half of it lies behind.
+    assert np.nanmax(heights) == pytest.approx(0.5, abs=0.01) and np.nanmin(heights) < 0
+    assert {"facade.png", "facade_class.tif", "facade_deviation.tif"} <= {p.name for p in (tmp_path / "d").iterdir()}
+    assert value(read_json(tmp_path / "d/drawings.json"), "facade_scale") > 0
+    with pytest.raises(StageError, match="lie in a line"):
+        facade_axes(closed, np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
+
+
 def test_a_bridge_is_not_drawn_in_the_colours_of_what_lies_behind_it(closed):
     below = closed.part(closed.vertices.points[closed.faces][..., 2].max(1) < 0)
     red = np.full((8, 8, 3), (255, 0, 0), np.uint8)
@@ -396,6 +417,15 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
     # Nothing was left to do: a run that makes the page prints the closing lines itself.
     exported = "Export: results/objects/shed/surface.glb, results/objects/shed/drawings, results/summary/report.pdf\n"
     assert capsys.readouterr().out == f"{exported}Result: 1; results/summary\n"
+    facade = ["--facade", *["1", "-2", "3", "4", "5", "6", "7", "8", "9.5"]]
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "export", *facade])
+    with pytest.raises(SystemExit, match="name it by --object"):
+        command_line.main()
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "export", "--object", "shed", *facade])
+    with pytest.raises(SystemExit):
+        command_line.main()
+    assert Path("results/objects/shed/facade.txt").read_text() == "1.0 -2.0 3.0 4.0 5.0 6.0 7.0 8.0 9.5"
+    capsys.readouterr()
     made, page = iter([(1, 1), (2, 2)]), "results/summary/report.html"
     monkeypatch.setattr(subprocess, "run", lambda words, **_: os.utime(page, next(made)) or done)
     monkeypatch.setattr(sys, "argv", words)

@@ -51,6 +51,12 @@ def exported_surfaces():
     return [str(path) for path in files if path.is_file()]
 
 
+def facade_of(wildcards):
+    """The three points of a facade that `scenefuse export --facade` was given."""
+    path = Path(f"results/objects/{wildcards.object}/facade.txt")
+    return f"--facade {path.read_text()}" if path.is_file() else ""
+
+
 def what_is_given(row):
     """What of a scene or an object its row gives: photos, cloud, or both."""
     if not row.get("cloud"):

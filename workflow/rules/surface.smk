@@ -57,13 +57,14 @@ rule draw_surface:
         mem_mb=by_size(3000, surface=20),
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
+        facade=facade_of,
         script=script("surface/draw_surface.py"),
         code=code("surface/draw_surface.py"),
     message:
         "{wildcards.object}: drawings"
     shell:
         "exec python {params.script} --name {wildcards.object} --surface {input.surface} --glb {input.glb}"
-        " --georeference-json {input.georeference} --folder {output} &> {log}"
+        " --georeference-json {input.georeference} {params.facade} --folder {output} &> {log}"
 
 
 rule export_cameras:

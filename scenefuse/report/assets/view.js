@@ -125,7 +125,9 @@ class View {
     this.legend = section.querySelector(".view-legend");
     this.output = section.querySelector("output");
     this.marks = section.querySelector(".marks");
-    this.button = section.querySelector(".measure");
+    // By what is pressed: how many points it takes.
+    this.tools = new Map([[section.querySelector(".measure"), 2], [section.querySelector(".facade"), 3]]);
+    this.command = section.querySelector(".command");
     this.picked = [];
     this.camera = null;
     this.plot = null;
@@ -138,7 +140,7 @@ class View {
     return this.modes.find((mode) => mode.name === name);
   }
   get modes() { return (this.shown === "surface" ? this.about.surface : this.about).modes; }
-  get measuring() { return this.button.getAttribute("aria-pressed") === "true"; }
+  get measuring() { return [...this.tools.keys()].find((tool) => tool.getAttribute("aria-pressed") === "true"); }
 
   async start() {
     if (this.starting) return;
@@ -310,9 +312,23 @@ class View {
   measure(x, y) {
     const point = this.pick(x, y);
     if (!point) { this.output.textContent = "No point there."; return; }
-    this.picked = this.picked.length === 1 ? [this.picked[0], point] : [point];
-    this.output.textContent = this.picked.length === 1 ? "Now the second point." : this.distance();
+    const wanted = this.tools.get(this.measuring);
+    this.picked = this.picked.length < wanted ? [...this.picked, point] : [point];
+    const left = wanted - this.picked.length;
+    this.command.hidden = wanted < 3 || left > 0;
+    if (left) this.output.textContent = left > 1 ? "Now two more." : "Now one more.";
+    else if (wanted === 2) this.output.textContent = this.distance();
+    else this.facade();
     this.drawMarks();
+  }
+
+  // The command that draws the plane through the picked points.
+  facade() {
+    const { name, scene_from_view: rows } = this.about.surface;
+    const places = this.picked.map(([x, y, z]) => rows.map(([a, b, c, d]) => a * x + b * y + c * z + d));
+    const numbers = places.flat().map((x) => Number(x.toPrecision(8))).join(" ");
+    this.command.textContent = `scenefuse export --what drawings --object ${name} --facade ${numbers}`;
+    this.output.textContent = "Below is the command that draws it.";
   }
 
   distance() {
@@ -337,20 +353,23 @@ class View {
         (0.5 - (m[1] * x + m[5] * y + m[9] * z + m[13]) / w * 0.5) * high];
     });
     const nodes = [], [a, b] = seen;
-    if (a && b) {
+    const measured = seen.length === 2 && a && b && this.tools.get(this.measuring) === 2;
+    if (measured) {
       const ends = { x1: a[0], y1: a[1], x2: b[0], y2: b[1] };
       nodes.push(draw("line", ends), draw("line", ends));
     }
     seen.filter(Boolean).forEach(([cx, cy]) => nodes.push(draw("circle", { cx, cy, r: 5 })));
-    if (a && b) nodes.push(draw("text", { x: (a[0] + b[0]) / 2, y: (a[1] + b[1]) / 2 - 8 }, this.distance()));
+    if (measured) nodes.push(draw("text", { x: (a[0] + b[0]) / 2, y: (a[1] + b[1]) / 2 - 8 }, this.distance()));
     this.marks.replaceChildren(...nodes);
   }
 
-  setMeasuring(on) {
-    this.button.setAttribute("aria-pressed", on);
-    this.stage.classList.toggle("measuring", on);
+  // With one of the tools, or none.
+  setMeasuring(chosen) {
+    for (const tool of this.tools.keys()) tool.setAttribute("aria-pressed", tool === chosen);
+    this.stage.classList.toggle("measuring", Boolean(chosen));
     this.picked = [];
-    this.output.textContent = on ? "Click two points." : "";
+    this.command.hidden = true;
+    this.output.textContent = { 2: "Click two points.", 3: "Click three points of it, far apart." }[this.tools.get(chosen)] ?? "";
     this.drawMarks();
   }
 
@@ -380,15 +399,16 @@ class View {
     if (moves[event.key]) this.move(...moves[event.key]);
     else if (event.key === "Enter" && this.measuring)
       this.measure(this.stage.clientWidth / 2, this.stage.clientHeight / 2);
-    else if (event.key === "Escape" && this.measuring) this.setMeasuring(false);
+    else if (event.key === "Escape" && this.measuring) this.setMeasuring(null);
     else return;
     event.preventDefault();
   }
 
   listen() {
-    const { section, stage, button } = this;
+    const { section, stage, tools } = this;
     section.querySelectorAll("input").forEach((input) => input.addEventListener("change", () => this.show()));
-    button.addEventListener("click", () => this.setMeasuring(!this.measuring));
+    for (const tool of tools.keys())
+      tool.addEventListener("click", () => this.setMeasuring(tool === this.measuring ? null : tool));
     section.querySelector(".home").addEventListener("click", () => {
       this.plot?.setCamera(this.home());
       this.plot?.render();
