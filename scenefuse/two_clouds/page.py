@@ -7,6 +7,8 @@ from string import Template
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import Normalize
 from PIL import Image
 
 from scenefuse.cloud.clouds import Cloud, voxel_downsample
@@ -99,7 +101,11 @@ def write_box_page(page: Path, scene: Cloud, up: Array | None, boxes: list[Array
     away = middle + ((high - low)[along] + pixel) * toward
     camera = Camera(np.array([right, -upward, -toward]), away, 1 / pixel, *map(int, size), orthographic=True)
     thinned = voxel_downsample(scene, pixel, mean_colors=True)
-    picture = render(thinned, camera, point_radii(thinned.points))
+    heights = thinned.points[:, along] * toward[along]
+    # Without colours, by height.
+    by_height = colormaps["viridis"](Normalize(*np.percentile(heights, [2, 98]), clip=True)(heights), bytes=True)[:, :3]
+    colors = by_height if thinned.colors is None else thinned.colors
+    picture = render(thinned, camera, point_radii(thinned.points), colors)
     steps = np.array([right[axes[0]] * pixel, -pixel])
     decimals = max(0, int(np.ceil(-np.log10(pixel))))
     about = {

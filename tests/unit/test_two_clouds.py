@@ -392,7 +392,8 @@ def test_the_box_drawn_in_the_page_of_a_refusal_holds_the_object_and_its_command
     if not phone:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
-            assert tyro.cli(register, args=words[2:]) == 0
+            options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)
+            assert tyro.cli(register, args=words[2:], config=options) == 0
 
 
 @pytest.mark.parametrize(
