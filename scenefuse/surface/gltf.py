@@ -199,7 +199,8 @@ def read_painted(path: Path) -> Painted | None:
         parts.append((points, faces, classes, uv))
         count += len(points)
     picture = np.asarray(Image.open(io.BytesIO(view(content["images"][0]["bufferView"]))).convert("RGB"))
-    return Painted(*(np.concatenate(part) for part in zip(*parts)), picture)
+    points, faces, classes, uv = (np.concatenate(part) for part in zip(*parts))
+    return Painted(points, faces, classes, uv, picture)
 
 
 def _primitive(buffer: _Buffer, part: Surface, kind: FaceClass, metres: float, uv: Array | None) -> dict[str, Any]:

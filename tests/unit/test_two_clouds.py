@@ -391,9 +391,10 @@ def test_the_box_drawn_in_the_page_of_a_refusal_holds_the_object_and_its_command
     assert words[:2] == ["scenefuse", "register"] and words[words.index("--up-scene") + 1] == "0"
     if not phone:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+            searched = registered_at_once(patch, Sim3(1.0, np.eye(3), UTM) @ house.scene_from_object)
             options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)
             assert tyro.cli(register, args=words[2:], config=options) == 0
+        assert len(searched[0][1]) == len(house.scene)
 
 
 @pytest.mark.parametrize(
