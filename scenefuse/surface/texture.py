@@ -68,19 +68,21 @@ def textured(surface: Surface, photos: list[View], read: Callable[[int], NDArray
     wanted = 2 * small.areas()[painted].sum() * np.median(pixels[pixels > 0])
     side = int(np.clip(np.sqrt(wanted), 64, MAX_SIDE_PX))
     uv = _unfolded(points, faces, side)
-    face, places = _texels(points, faces, uv, side)
-    best = np.argsort(-worth[:, painted], axis=0)[:CONFIRMING_PHOTOS]
+    face, weights, places = _texels(points, faces, uv, side)
+    of_face, of_vertex = best_worth(worth[:, painted]), vertex_worth(worth[:, painted], faces, len(points))
     color, weight = np.zeros((len(face), 3)), np.zeros(len(face))
     for number, view in enumerate(photos):
-        of_face = np.where((best == number).any(0), worth[number, painted], 0.0)
-        rows = np.flatnonzero(of_face[face[:, 2]] > 0)
+        # From corner to corner, so that no step is seen between faces; a face by itself where corners see nothing.
+        corners, alone = of_vertex[number][faces], 1e-6 * of_face[number]
+        rows = np.flatnonzero((corners.any(1) | (alone > 0))[face[:, 2]])
         if not len(rows):
             continue
+        share = (corners[face[rows, 2]] * weights[rows]).sum(1) + alone[face[rows, 2]]
         pixels = read(number)
         at = view.project(places[rows])[0][:, ::-1].T - 0.5
         found = np.stack([map_coordinates(pixels[..., k], at, np.float64, 1, mode="nearest") for k in range(3)], 1)
-        color[rows] += of_face[face[rows, 2], None] * gains[number] * found
-        weight[rows] += of_face[face[rows, 2]]
+        color[rows] += share[:, None] * gains[number] * found
+        weight[rows] += share
     shown = weight > 0
     color[shown] /= weight[shown, None]
     if small.vertices.colors is not None and not shown.all():
@@ -176,8 +178,26 @@ def _unfolded(points: Array, faces: Rows, side: int) -> Array:
     return np.stack([uv[..., 0], 1 - uv[..., 1]], axis=-1)
 
 
-def _texels(points: Array, faces: Rows, uv: Array, side: int) -> tuple[Rows, Array]:
-    """(T, 3) column and row of the texels on faces, and which face, and the places (T, 3) that they show."""
+def best_worth(worth: Array) -> Array:
+    """(V, N) the worth of the photos that show each face or corner best; 0 of the others."""
+    best = np.argsort(-worth, axis=0)[:CONFIRMING_PHOTOS]
+    kept = np.zeros_like(worth)
+    np.put_along_axis(kept, best, np.take_along_axis(worth, best, axis=0), axis=0)
+    return kept
+
+
+def vertex_worth(worth: Array, faces: Rows, count: int) -> Array:
+    """(V, N) the same of corners: the least of their faces, so that a photo fades out towards what it does not show."""
+    least = np.full((len(worth), count), np.inf)
+    for corner in faces.T:
+        for own, row in zip(least, worth):
+            np.minimum.at(own, corner, row)
+    return best_worth(np.where(np.isfinite(least), least, 0.0))
+
+
+def _texels(points: Array, faces: Rows, uv: Array, side: int) -> tuple[Rows, Array, Array]:
+    """(T, 3) column and row of the texels on faces, and which face; (T, 3) weights of its corners, and the places
+    (T, 3) that they show."""
     flat = np.column_stack([uv.reshape(-1, 2) * side, np.zeros(3 * len(faces))])
     scene = caster(flat, np.arange(len(flat)).reshape(-1, 3))
     column, row = (a.ravel() for a in np.meshgrid(np.arange(side), np.arange(side)))
@@ -185,7 +205,7 @@ def _texels(points: Array, faces: Rows, uv: Array, side: int) -> tuple[Rows, Arr
     hit = cast(scene, origins, np.tile([0.0, 0, 1], (len(row), 1)))
     on = np.isfinite(hit["t_hit"])
     face = hit["primitive_ids"][on].astype(np.int64)
-    b, c = hit["primitive_uvs"][on].astype(np.float64).T
-    corners = points[faces[face]]
-    places = corners[:, 0] + b[:, None] * (corners[:, 1] - corners[:, 0]) + c[:, None] * (corners[:, 2] - corners[:, 0])
-    return np.column_stack([column[on], row[on], face]), places
+    b, c = hit["primitive_uvs"][on].T
+    weights = np.column_stack([1 - b - c, b, c])
+    places = (points[faces[face]] * weights[..., None]).sum(1)
+    return np.column_stack([column[on], row[on], face]), weights, places

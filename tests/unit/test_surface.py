@@ -31,7 +31,7 @@ from scenefuse.surface.cameras import export_cameras
 from scenefuse.surface.drawings import NOTHING, SIDES, draw, draw_surface, facade_axes, wall_turn
 from scenefuse.surface.gltf import Painted, write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
-from scenefuse.surface.mesh import FaceClass, make_mesh
+from scenefuse.surface.mesh import FaceClass, Surface, make_mesh
 from scenefuse.surface.texture import textured
 
 # Spacing of points on a sphere, and the radius of a gap in it that is narrow beside its diagonal.
@@ -232,6 +232,35 @@ def test_a_planted_picture_lands_on_the_faces_that_a_photo_shows_it_on(closed):
     assert np.allclose(color[middle[:, 2] < -0.5], 100, atol=2)
 
 
+def test_a_photo_fades_out_towards_where_it_ends():
+    """A plane in two photos; one ends in its middle, and is brighter there."""
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21)))
+    low = np.flatnonzero((x < 0.99) & (y < 0.99))
+    faces = np.concatenate([np.column_stack([low, low + 1, low + 22]), np.column_stack([low, low + 22, low + 21])])
+    grey, up = np.full((len(x), 3), 100, np.uint8), np.tile(np.float32([0, 0, 1]), (len(x), 1))
+    vertices = Cloud(np.column_stack([x, y, 0 * x]), up, grey, {"deviation": np.zeros(len(x), np.float32)})
+    surface = Surface(vertices, faces, np.full(len(faces), FaceClass.MEASURED, np.uint8), 0.0)
+    centre, pose = np.array([0, 0, 5.0]), np.eye(4)
+    pose[:3, :3] = look_at(centre, np.zeros(3), np.array([0, 1.0, 0]))
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    lens = np.array([[900.0, 0, 400], [0, 900, 400], [0, 0, 1]])
+    photos = np.random.default_rng(0).integers(98, 103, (2, 800, 800, 3)).astype(np.uint8)
+    photos[1, :, 345:] += 60
+    painted = textured(surface, [View(str(k), lens, pose, (800, 400)[k], 800) for k in (0, 1)], lambda k: photos[k])
+    picture = Painted(
+        painted.surface.vertices.points[faces].reshape(-1, 3),
+        np.arange(3 * len(faces)).reshape(-1, 3),
+        surface.classes,
+        painted.uv.reshape(-1, 2),
+        painted.picture,
+    )
+    drawing = draw(surface, picture, np.eye(3), 1 / 180)
+    profile = drawing.colors[20:-20, :, 0].mean(0)
+    middle = round(-drawing.left * 180)
+    near = profile[middle - 50 : middle + 50]
+    assert np.ptp(near) > 20 and np.abs(np.diff(near)).max() < 8
+
+
 def test_an_elevation_has_the_scale_that_it_says(coarse, tmp_path: Path):
     write_surface(tmp_path / "surface.ply", coarse)
     write_glb(tmp_path / "surface.glb", coarse, {})
@@ -253,16 +282,16 @@ def test_an_elevation_has_the_scale_that_it_says(coarse, tmp_path: Path):
     assert (tmp_path / "d/drawings.pdf").read_bytes()[:4] == b"%PDF"
 
 
-def test_a_facade_is_drawn_of_the_plane_through_three_points_from_outside(closed, tmp_path: Path):
+def test_a_facade_is_drawn_of_the_plane_through_three_points_from_outside(coarse, tmp_path: Path):
     """A plane that cuts the ball half a radius in front of its middle, towards east and a little north."""
     toward = Rotation.from_euler("z", 30, degrees=True).apply([1.0, 0, 0])
     corners = 0.5 * toward + np.array([[0, 0, -0.3], [0, 0, 0.3], np.cross([0, 0, 0.4], toward)])
-    write_surface(tmp_path / "surface.ply", closed)
-    write_glb(tmp_path / "surface.glb", closed, {})
+    write_surface(tmp_path / "surface.ply", coarse)
+    write_glb(tmp_path / "surface.glb", coarse, {})
     files = {"surface": tmp_path / "surface.ply", "glb": tmp_path / "surface.glb", "folder": tmp_path / "d"}
     for order in ([0, 1, 2], [1, 0, 2]):
         np.testing.assert_allclose(
-            facade_axes(closed, corners[order]), [np.cross([0, 0, 1], toward), [0, 0, 1], toward], atol=1e-9
+            facade_axes(coarse, corners[order]), [np.cross([0, 0, 1], toward), [0, 0, 1], toward], atol=1e-9
         )
     draw_surface(name="ball", facade=tuple(corners.ravel()), **files)
     heights = rasterio.open(tmp_path / "d/facade_height.tif").read(1)
@@ -271,7 +300,7 @@ def test_a_facade_is_drawn_of_the_plane_through_three_points_from_outside(closed
     assert {"facade.png", "facade_class.tif", "facade_deviation.tif"} <= {p.name for p in (tmp_path / "d").iterdir()}
     assert value(read_json(tmp_path / "d/drawings.json"), "facade_scale") > 0
     with pytest.raises(StageError, match="lie in a line"):
-        facade_axes(closed, np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
+        facade_axes(coarse, np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
 
 
 def test_a_bridge_is_not_drawn_in_the_colours_of_what_lies_behind_it(closed):
