@@ -51,9 +51,9 @@ def exported_surfaces():
     return [str(path) for path in files if path.is_file()]
 
 
-def facade_of(wildcards):
-    """The three points of a facade that `scenefuse export --facade` was given."""
-    path = Path(f"results/objects/{wildcards.object}/facade.txt")
+def facade_of(name):
+    """The option with the three points of an object's facade that `scenefuse export --facade` was given."""
+    path = Path(f"results/objects/{name}/facade.txt")
     return f"--facade {path.read_text()}" if path.is_file() else ""
 
 

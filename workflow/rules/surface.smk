@@ -57,7 +57,7 @@ rule draw_surface:
         mem_mb=by_size(3000, surface=20),
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
-        facade=facade_of,
+        facade=lambda wildcards: facade_of(wildcards.object),
         script=script("surface/draw_surface.py"),
         code=code("surface/draw_surface.py"),
     message:
