@@ -17,7 +17,7 @@ from scenefuse.core.stage import threads
 from scenefuse.core.transforms import MAX_DEVIATIONS, Array
 from scenefuse.fuse.measure import RESOLUTION, Measured
 from scenefuse.geometry.depth_test import CELL_SPACINGS, see
-from scenefuse.geometry.photo_kernel import MIN_AGREEING
+from scenefuse.geometry.photo_check import MIN_AGREEING
 from scenefuse.photos.workspace import View
 
 Mask = NDArray[np.bool_]

@@ -12,12 +12,8 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.depth_test import Where, place
 from scenefuse.geometry.photo_check import MAX_PHOTOS
 from scenefuse.photos.workspace import View
-
-# Depths that differ by this share are of two surfaces: no slanted one has such a step.
-DEPTH_JUMP = 0.03
 
 
 @dataclass(frozen=True)
@@ -142,10 +138,11 @@ def _compare(points, compared, depths, masks, covered, intrinsics, frame_from_ca
                 if not masks[other, row, column] and (len(covered) == 0 or z < covered[other, row, column]):
                     counts[2, n] += 1
                 measured = depths[other, row, column]
-                found = place(z, measured, measured, tolerance)
-                if found == Where.IN_FRONT:
+                if not measured > 0:
+                    continue
+                if z < measured - tolerance:
                     counts[1, n] += 1
-                elif found == Where.AT:
+                elif z <= measured + tolerance:
                     counts[0, n] += 1
                     # The other view's depth, taken along the ray through the point itself, not the pixel's centre.
                     for axis in range(3):
@@ -236,8 +233,8 @@ def _count(depth, other, there, back, max_error, max_px, agree, through):  # typ
                 off_x = (back[0, 0] * bx + back[0, 1] * by + back[0, 2] * e + back[0, 3]) / bz - (column + 0.5)
                 off_y = (back[1, 0] * bx + back[1, 1] * by + back[1, 2] * e + back[1, 3]) / bz - (row + 0.5)
                 near = off_x * off_x + off_y * off_y <= max_px * max_px
-                same |= near and place(z, e, e, max_error * z) == Where.AT
-                behind &= (not near) and place(z, e, e, 0.0) == Where.IN_FRONT
+                same |= near and e - max_error * z <= z <= e + max_error * z
+                behind &= (not near) and z < e
             if same:
                 agree[row, column] += np.uint16(1)
             elif behind:

@@ -12,19 +12,21 @@ from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
-from numba import vectorize
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.photo_kernel import MIN_COSINE
 from scenefuse.photos.pictures import read_depth
 from scenefuse.photos.workspace import View, posed_images, read_model, view_of
 
 # Side of a cell in spacings of the surface's points, so that a surface has no holes between them; and how many spacings
 # behind the nearest points a noisy surface still reaches.
 CELL_SPACINGS, SURFACE_SPACINGS = 2.0, 8.0
+# Photos that look along a surface (beyond 75 degrees) show little of it.
+MIN_COSINE = 0.25
+# Depths that differ by this share are of two surfaces: no slanted one has such a step.
+DEPTH_JUMP = 0.03
 # Below this share of points with a measurement on their rays, depth maps tell nothing of an object.
 MIN_MEASURED = 0.1
 
@@ -40,19 +42,6 @@ class Where(IntEnum):
     BEHIND = 4
 
 
-@vectorize(cache=True)
-def place(depth, nearest, farthest, tolerance):  # type: ignore[no-untyped-def]
-    """Where a depth lies beside the nearest and the farthest that a map holds there, 0 for none; never OUTSIDE.
-
-    A NumPy ufunc that Numba's kernels also call.
-    """
-    if nearest > 0 and depth < nearest - tolerance:
-        return np.int8(Where.IN_FRONT)
-    if farthest > 0 and depth > farthest + tolerance:
-        return np.int8(Where.BEHIND)
-    return np.int8(Where.AT) if nearest > 0 and farthest > 0 else np.int8(Where.UNKNOWN)
-
-
 def depth_test(points: Array, view: View, tolerance: float, farthest: Array | None = None) -> NDArray[np.int8]:
     """(N,) where points (N, 3) lie beside a view's depth map, as values of `Where`.
 
@@ -65,7 +54,11 @@ def depth_test(points: Array, view: View, tolerance: float, farthest: Array | No
     rows, pixels, depth = view.visible(points)
     at = pixels[:, 1], pixels[:, 0]
     found = np.full(len(points), Where.OUTSIDE, np.int8)
-    found[rows] = place(depth, view.pixels[at], (view.pixels if farthest is None else farthest)[at], tolerance)
+    nearest = view.pixels[at].astype(np.float64)
+    last = nearest if farthest is None else farthest[at]
+    in_front, behind = (nearest > 0) & (depth < nearest - tolerance), (last > 0) & (depth > last + tolerance)
+    known = (nearest > 0) & (last > 0)
+    found[rows] = np.select([in_front, behind, known], [Where.IN_FRONT, Where.BEHIND, Where.AT], Where.UNKNOWN)
     return found
 
 

@@ -12,9 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.geometry.photo_kernel import CONFIRMING_PHOTOS, OFFSETS, match_points
 from scenefuse.photos.workspace import View, Workspace
 
+# Steps before and behind the point that are matched too; a step moves a patch by about a pixel in the other photos.
+OFFSETS = 4
+# Photos that must confirm a point for it to be measured; as many of the others count at each offset, since the rest
+# may not see the place (Goesele et al. 2006).
+CONFIRMING_PHOTOS = 3
+# Photos or depth maps that must agree where one may by chance.
+MIN_AGREEING = 2
 # Least weighted NCC of a photo that confirms a point, and by how much more another offset may score.
 MIN_MATCH, MAX_DROP = 0.6, 0.1
 # Largest standard deviation of a measured point in steps along the ray, of about a pixel: windows that match as well
@@ -187,6 +193,9 @@ def halved(photos: Photos) -> Photos:
 
 def _match(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Matches:
     """`match_in` at one size of the photos."""
+    # Numba takes half a second to load, and most jobs that read this module match nothing.
+    from scenefuse.geometry.photo_kernel import match_points
+
     count = len(points)
     curve, noise = np.full((count, 2 * OFFSETS + 1), -1.0), np.full(count, np.inf)
     tested, confirming = np.zeros(count, np.int64), np.zeros(count, np.int64)

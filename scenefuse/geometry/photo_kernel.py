@@ -5,21 +5,15 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from scenefuse.geometry.depth_test import MIN_COSINE
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, OFFSETS
+
 # Samples on each side of a patch's middle: 7 x 7 of them, a pixel of the sharpest photo apart.
 RADIUS = 3
-# Steps before and behind the point that are matched too; a step moves a patch by about a pixel in the other photos.
-OFFSETS = 4
 # Photos at most that one point is compared in, beside its reference.
 OTHERS = 10
-# Photos that must confirm a point for it to be measured; as many of the others count at each offset, since the rest
-# may not see the place (Goesele et al. 2006).
-CONFIRMING_PHOTOS = 3
-# Photos or depth maps that must agree where one may by chance.
-MIN_AGREEING = 2
 # Grey levels over which a sample's weight falls: across an edge a patch does not mix two surfaces (Yoon, Kweon 2006).
 GREY_FALL = 25.0
-# Photos that look along a surface (beyond 75 degrees) show little of it.
-MIN_COSINE = 0.25
 # Between two rays to a point: below the first a match does not locate it, beyond the last patches look different; the
 # second is as good as any up to half way to the last.
 MIN_ANGLE, GOOD_ANGLE, MAX_ANGLE = math.radians(3), math.radians(12), math.radians(60)

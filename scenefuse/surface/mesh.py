@@ -18,7 +18,7 @@ from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import MARGIN, MIN_AGREEING, SAME_PLACE_SPACINGS
 from scenefuse.fuse.measure import NEIGHBOURS, SUPPORT, Evidence, with_normals
-from scenefuse.geometry.photo_kernel import MIN_COSINE
+from scenefuse.geometry.depth_test import MIN_COSINE
 from scenefuse.photos.workspace import View
 
 Rows = NDArray[np.int64]

@@ -109,6 +109,18 @@ def test_reading_the_rules_imports_nothing_heavy():
     assert done.stdout.decode().strip() == "[]", done.stderr.decode()
 
 
+@pytest.mark.process
+def test_crops_registration_and_metrics_begin_without_numba_and_torch():
+    # Of the jobs of an object with four variants these are a half, each of a few seconds.
+    stages = ("crop.crop_scene", "register.coarse", "register.fine", "metrics.compute_metrics")
+    modules = ", ".join(f"scenefuse.{stage}" for stage in stages)
+    source = f"import sys, {modules}\nprint(sorted({{'numba', 'torch', 'open3d', 'pandas'}} & set(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", source], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True
+    )
+    assert done.stdout.decode().strip() == "[]", done.stderr.decode()
+
+
 def test_default_profile_holds_nothing_of_a_machine_and_shows_no_commands():
     profile = yaml.safe_load((ROOT / "profiles/default/config.yaml").read_text())
     assert not {"cores", "jobs", "executor", "resources", "default-resources"} & set(profile)
