@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.cloud_file import NEIGHBOURS
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing
 from scenefuse.core.stage import threads
-from scenefuse.core.transforms import MAX_DEVIATIONS, Array
+from scenefuse.core.transforms import Array
 from scenefuse.fuse.measure import RESOLUTION, Measured
 from scenefuse.geometry.depth_test import CELL_SPACINGS, see
 from scenefuse.geometry.photo_check import MIN_AGREEING
@@ -40,12 +40,14 @@ MARGIN = RESOLUTION
 # Share of the photos that a point is open to which must see through it, and MIN_AGREEING of them: a surface that is
 # wrong itself lies behind good points in some photos; a point that is not there has surfaces behind it in many.
 THROUGH_SHARE = 0.2
-# Points of both sides show the same place within MAX_DEVIATIONS of their common standard deviations, or so many
-# spacings of the sparser side where that is more; never farther than twice the RESOLUTION.
-SAME_PLACE_SPACINGS = 1.5
+# Points of both sides show the same place within so many of their common standard deviations, or so many spacings of
+# the sparser side where that is more; never farther than twice the RESOLUTION.
+SAME_PLACE_DEVIATIONS, SAME_PLACE_SPACINGS = 5.0, 1.5
 # The object's points give way where the scene's standard deviation is smaller by more than this factor: the
-# object's cloud is usually denser, so it wins ties; where the scene's is denser by as much, the scene wins.
+# object's cloud is usually denser, so it wins ties; where the scene's is denser, the scene wins.
 BETTER_FACTOR = 1.5
+# Points of the scene for each of the object's, on the surface that both have, from which the scene is the denser.
+DENSER_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float, share: floa
     if len(second):
         rough, other_rough = _rougher(first, second, 2 * max(RESOLUTION * diagonal, CELL_SPACINGS * coarse))
         mine, other = np.hypot(mine, rough), np.hypot(other, other_rough)
-    is_denser = _times_as_many(second.points, first.points, coarse) > BETTER_FACTOR * share
+    is_denser = _times_as_many(second.points, first.points, coarse) > DENSER_FACTOR * share
     factor = 1 / BETTER_FACTOR if is_denser else BETTER_FACTOR
     theirs = np.full(len(points), np.inf)
     theirs[scene.surface] = other
@@ -124,7 +126,7 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float, share: floa
 
     def is_same(distance: Array, one: Array, two: Array, least: Array | float) -> Mask:
         common = np.hypot(one, np.where(np.isfinite(two), two, typical))
-        return np.asarray(distance <= np.clip(MAX_DEVIATIONS * common, least, 2 * RESOLUTION * diagonal))
+        return np.asarray(distance <= np.clip(SAME_PLACE_DEVIATIONS * common, least, 2 * RESOLUTION * diagonal))
 
     distance, partner = cKDTree(first.points).query(points, workers=threads())
     # A measured point of the scene is on the object's surface or beside it, on the ground for instance.
@@ -134,7 +136,7 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float, share: floa
     worse &= ~scene.surface | (_beside(points, first[partner]) <= coarse)
     if len(second):
         # What it did not measure may well be right where the object measures less exactly than the scene.
-        inexact = (mine[partner] > BETTER_FACTOR * typical) & (distance <= MAX_DEVIATIONS * mine[partner])
+        inexact = (mine[partner] > BETTER_FACTOR * typical) & (distance <= SAME_PLACE_DEVIATIONS * mine[partner])
         worse &= scene.surface | ~inexact
         distance, partner = cKDTree(second.points).query(first.points, workers=threads())
         # A better point of a sparser side stands for what lies within a spacing of the object's.
