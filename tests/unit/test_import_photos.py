@@ -399,7 +399,7 @@ def sphere_on_disk(root):
 
 def test_a_sphere_from_the_files_to_its_cloud_and_a_nerf_without_a_cloud(tmp_path, quick, monkeypatch):
     data, out = sphere_on_disk(tmp_path / "in"), tmp_path / "out"
-    trained = {"data": data, "out": out, "masks": data / "masks", "config": quick, "epochs": 4}
+    trained = {"data": data, "out": out, "masks": data / "masks", "config": quick, "epochs": 3}
     assert train_nerf(**trained, options=OPTIONS) == 0
     report = read_json(out / "report.json")
     assert value(report["nerf"], "photos_measured") == 2 and value(report["nerf"], "psnr_held_out") > 15

@@ -159,7 +159,8 @@ def box_surface(count, seed):
 @pytest.fixture(autouse=True, scope="module")
 def small_pictures():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scenefuse.report.figures.TILE_PX", (160, 120))
+        for module in ("figures", "scene_figures"):
+            patch.setattr(f"scenefuse.report.{module}.TILE_PX", (160, 120))
         yield
 
 
