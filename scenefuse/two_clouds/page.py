@@ -96,21 +96,22 @@ def write_box_page(page: Path, scene: Cloud, up: Array | None, boxes: list[Array
     # Free space around it, so that a rectangle can go around what lies at its border.
     size_px = 3 * TILE_PX[0]
     pixel = 1.1 * float(max((high - low)[axes].max(), 1e-9)) / size_px
-    size = np.ceil((high - low)[axes] / pixel + 0.1 * size_px).astype(int)
+    width, height = (int(side) for side in np.ceil((high - low)[axes] / pixel + 0.1 * size_px))
     middle = (low + high) / 2
     away = middle + ((high - low)[along] + pixel) * toward
-    camera = Camera(np.array([right, -upward, -toward]), away, 1 / pixel, *map(int, size), orthographic=True)
+    camera = Camera(np.array([right, -upward, -toward]), away, 1 / pixel, width, height, orthographic=True)
     thinned = voxel_downsample(scene, pixel, mean_colors=True)
     heights = thinned.points[:, along] * toward[along]
     # Without colours, by height.
-    by_height = colormaps["viridis"](Normalize(*np.percentile(heights, [2, 98]), clip=True)(heights), bytes=True)[:, :3]
+    ends = np.percentile(heights, [2, 98])
+    by_height = colormaps["viridis"](Normalize(ends[0], ends[1], clip=True)(heights), bytes=True)[:, :3]
     colors = by_height if thinned.colors is None else thinned.colors
     picture = render(thinned, camera, point_radii(thinned.points), colors)
     steps = np.array([right[axes[0]] * pixel, -pixel])
     decimals = max(0, int(np.ceil(-np.log10(pixel))))
     about = {
         "axes": axes,
-        "corner": (middle[axes] - steps * size / 2).tolist(),
+        "corner": (middle[axes] - steps * [width / 2, height / 2]).tolist(),
         "step": steps.tolist(),
         "heights": [float(low[along]) - pixel, float(high[along]) + pixel],
         "decimals": decimals,
@@ -123,8 +124,8 @@ def write_box_page(page: Path, scene: Cloud, up: Array | None, boxes: list[Array
         axis="xyz"[along],
         places=f"Places that look like it: {''.join(buttons)}" if boxes else "",
         picture=webp(Image.fromarray(picture)),
-        width=size[0],
-        height=size[1],
+        width=width,
+        height=height,
         about=json.dumps(about).replace("</", "<\\/"),
     )
     with atomic_file(page) as temporary:
