@@ -27,7 +27,7 @@ POLYNOMIALS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV",
 # Of these, a second radial term makes a richer one.
 ONE_TERM = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL")
 
-# The lens is chosen on so many points, those that most photos see, and the spread of a model is of so many.
+# The lens is chosen on so many points, and the spread of a model is of so many.
 MAX_POINTS = 4000
 
 Held = list[tuple[int, int, Array]]
@@ -116,13 +116,13 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
 
 
 def hold_out(model: pycolmap.Reconstruction) -> tuple[pycolmap.Reconstruction, Held]:
-    """A copy of a model with the points in most photos, without one observation of each long track, and these: point,
-    photo, (2,) pixels."""
+    """A copy of a model with MAX_POINTS of its points, drawn at random, without one observation of each long track, and
+    these: point, photo, (2,) pixels."""
     rng, kept, held = np.random.default_rng(0), copy.deepcopy(model), Held()
-    used = most_seen(model)
-    for point in set(model.point3D_ids()).difference(used):
+    drawn = rng.permutation(sorted(model.point3D_ids()))
+    for point in drawn[MAX_POINTS:].tolist():
         kept.delete_point3D(point)
-    for point in sorted(used):
+    for point in sorted(drawn[:MAX_POINTS].tolist()):
         track = model.points3D[point].track.elements
         if len(track) > MIN_PHOTOS:
             chosen = track[int(rng.integers(len(track)))]
@@ -130,11 +130,6 @@ def hold_out(model: pycolmap.Reconstruction) -> tuple[pycolmap.Reconstruction, H
             held.append((point, chosen.image_id, np.array(pixel)))
             kept.delete_observation(chosen.image_id, chosen.point2D_idx)
     return kept, held
-
-
-def most_seen(model: pycolmap.Reconstruction) -> list[int]:
-    """The points of a model that most photos see, these first."""
-    return sorted(model.point3D_ids(), key=lambda p: (-model.points3D[p].track.length(), p))[:MAX_POINTS]
 
 
 def enrich(camera: pycolmap.Camera, name: str) -> None:

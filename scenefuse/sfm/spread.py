@@ -19,7 +19,7 @@ from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, v
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.photos.workspace import read_model
 from scenefuse.sfm.colmap import MIN_PHOTOS, ROUGH_TOLERANCE, adjust
-from scenefuse.sfm.lens import LENSES, Lens, most_seen
+from scenefuse.sfm.lens import LENSES, MAX_POINTS, Lens
 
 # Groups of photos, each left out once.
 GROUPS = 8
@@ -98,7 +98,7 @@ def spread_of(model: pycolmap.Reconstruction, lens: Lens, beyond: Lens | None) -
         lens: what is refined.
         beyond: the next richer lens, or None.
     """
-    ids = most_seen(model)
+    ids = sorted(model.point3D_ids(), key=lambda p: (-model.points3D[p].track.length(), p))[:MAX_POINTS]
     points = np.array([model.points3D[p].xyz for p in ids]).reshape(-1, 3)
     names = sorted((model.images[i].name, i) for i in model.reg_image_ids())
     groups = min(GROUPS, len(names)) if len(names) > MIN_PHOTOS else 0
