@@ -22,6 +22,8 @@ Counts = NDArray[np.int32]
 # Photos that must frame a place: a share of those that frame this percentile of the object's own points, and
 # MIN_AGREEING.
 MIN_FRAMING_SHARE, FRAMING_PERCENTILE = 0.25, 10
+# With fewer own points, the photos that show the object whole count, or this share of all photos.
+MIN_WHOLE_SHARE = 1 / 3
 # Fewer points on the object do not show its extent.
 MIN_OWN_POINTS = 10
 # How far an object reaches beyond the points known of it, as a share of their extent: these seldom mark its ends.
@@ -144,7 +146,7 @@ def least_framing(views: Sequence[View], own: Array, share: float = MIN_FRAMING_
             framed[view.visible(own)[0]] += 1
         usual = float(np.percentile(framed, FRAMING_PERCENTILE))
     else:
-        usual = max(sum(is_whole(view.pixels) for view in views), MIN_FRAMING_SHARE * len(views))
+        usual = max(sum(is_whole(view.pixels) for view in views), MIN_WHOLE_SHARE * len(views))
     return max(MIN_AGREEING, int(np.ceil(share * usual)))
 
 

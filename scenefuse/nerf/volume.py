@@ -12,8 +12,8 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.geometry.surface import ends_of
 from scenefuse.geometry.visual_hull import (
-    MIN_FRAMING_SHARE,
     MIN_OWN_POINTS,
+    MIN_WHOLE_SHARE,
     NO_POINTS,
     Outline,
     count_silhouettes,
@@ -122,7 +122,7 @@ def _hides(outline: Outline, centres: Array, reach: float) -> NDArray[np.bool_]:
 def _rough_cube(views: list[View], own: Array) -> Sim3:
     """By the cameras where a quarter of the photos have the object whole; else around its own points, if it has some:
     what masks show of a facade has neither its middle nor its extent."""
-    if len(own) < MIN_OWN_POINTS or sum(is_whole(view.pixels) for view in views) >= MIN_FRAMING_SHARE * len(views):
+    if len(own) < MIN_OWN_POINTS or sum(is_whole(view.pixels) for view in views) >= MIN_WHOLE_SHARE * len(views):
         return cube_from_cameras(views)
     low, high = ends_of(own)
     side = float((high - low).max() + 2 * ROUGH_MARGIN * np.linalg.norm(high - low))
