@@ -342,6 +342,30 @@ def test_of_a_chunk_of_metashape_the_active_component_is_taken(tmp_path):
     assert [photo.name for photo in found] == [n[:-4] for n in FLIGHT.names[2:]]
 
 
+@pytest.mark.parametrize("small", ["before", "after", "disabled"])
+def test_of_several_chunks_of_metashape_the_largest_that_is_enabled_is_taken_and_said(tmp_path, small):
+    (tmp_path / "photos").mkdir()
+    for view in FLIGHT.views:
+        (tmp_path / "photos" / view.name).write_bytes(b"")
+    text = (path := metashape(tmp_path, placed="<transform><scale>3</scale></transform>")).read_text()
+    inside = text[text.index("<chunk") : text.index("</document>")]
+    other = re.sub(r"<camera .*?</camera>", "", inside, count=2, flags=re.DOTALL).replace("<scale>3", "<scale>7")
+    other = other.replace("<chunk", '<chunk label="North"', 1)
+    chunks = [other, inside] if small == "before" else [inside, other]
+    if small == "disabled":
+        chunks[0] = inside.replace("<chunk", '<chunk enabled="false"', 1)
+    path.write_text(text.replace(inside, "".join(chunks)))
+    found, _, notes = read_posed_photos(path, tmp_path / "photos")
+    scale, count = (7, 7) if small == "disabled" else (3, 9)
+    assert len(found) == count
+    np.testing.assert_allclose(
+        found[-1].object_from_cam[:3, 3], scale * FLIGHT.views[-1].world_from_cam[:3, 3], rtol=1e-9
+    )
+    said = {"before": "2 (chunk) is taken, with 9 photos, and not 1 (North) with 7", "disabled": None}
+    said["after"] = "1 (chunk) is taken, with 9 photos, and not 2 (North) with 7"
+    assert notes == ([f"the model {said[small]}"] if said[small] else [])
+
+
 def test_where_a_chunk_of_metashape_lies_has_to_be_known(tmp_path):
     (tmp_path / "photos").mkdir()
     for view in FLIGHT.views:
@@ -397,7 +421,7 @@ def test_wrong_files_of_metashape_and_bundler_are_named(tmp_path):
         (path.read_text().replace('sensor id="0" type="frame"', 'sensor id="0" type="spherical"'), "kind spherical"),
         (path.read_text().replace("adjusted", "none"), "has no calibration"),
         (path.read_text()[:200], "holds no cameras of Metashape"),
-        ("<document/>", "it has no chunk"),
+        ("<document/>", "it has no chunk that is enabled"),
     ):
         path.write_text(text)
         with pytest.raises(StageError, match=message):

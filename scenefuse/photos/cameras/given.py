@@ -109,6 +109,13 @@ def at_size(camera: pycolmap.Camera, size: Size, where: str) -> pycolmap.Camera:
     return scaled
 
 
+def largest(models: Mapping[str, Sequence[object]]) -> tuple[str, list[str]]:
+    """The name of the model with most photos, and a note where there are others."""
+    (name, photos), *others = sorted(models.items(), key=lambda model: -len(model[1])) or [("", [])]
+    counts = ", ".join(f"{other} with {len(given)}" for other, given in others)
+    return name, [f"the model {name} is taken, with {len(photos)} photos, and not {counts}"] if others else []
+
+
 def _same_shape(camera: pycolmap.Camera, size: Size) -> bool:
     return bool(abs(camera.width / camera.height * size[1] / size[0] - 1) <= SHAPE_TOLERANCE)
 

@@ -12,7 +12,7 @@ from scenefuse.cloud.crs import usable
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_text
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.photos.cameras.given import GivenCamera, Place, check_crs, colmap_camera
+from scenefuse.photos.cameras.given import GivenCamera, Place, check_crs, colmap_camera, largest
 
 # Parameters of its lens; those that are zero are left out of the file.
 PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
@@ -24,8 +24,9 @@ LOCAL = "LOCAL_CS"
 MAX_ALTITUDE_M = 40e3
 
 
-def read_metashape(file: Path) -> list[GivenCamera]:
-    """The photos that were aligned, in the active component, and are not disabled; lenses of the kind frame.
+def read_metashape(file: Path) -> tuple[list[GivenCamera], list[str]]:
+    """The photos that were aligned, in the active component, and are not disabled, lenses of the kind frame; and a note
+    where there are several chunks.
 
     Args:
         file: the XML; it names photos by their labels, mostly without their ending.
@@ -34,20 +35,18 @@ def read_metashape(file: Path) -> list[GivenCamera]:
         StageError: a lens of another kind, or a chunk that lies on the earth without a CRS.
         ValueError, KeyError, ET.ParseError: the file is no such XML.
     """
-    chunk = _chunk(file)
+    chunk, notes = _chunk(file)
     sensors = {sensor.attrib["id"]: sensor for sensor in chunk.iterfind("sensors/sensor")}
     lenses, found, moved = {}, [], _local_from_chunk(chunk, str(file))
-    for camera in _cameras_of(chunk):
-        placed, number = camera.find("transform"), camera.attrib["sensor_id"]
-        if placed is None or not placed.text:
-            continue
+    for camera in _aligned(chunk):
+        number = camera.attrib["sensor_id"]
         if number not in lenses:
             lenses[number] = _camera(sensors[number], f"{file}, sensor {number}")
-        pose = np.array(placed.text.split(), dtype=float).reshape(4, 4)
+        pose = np.array(camera.findtext("transform", "").split(), dtype=float).reshape(4, 4)
         if moved is not None:
             pose[:3, :3], pose[:3, 3] = moved.rotation @ pose[:3, :3], moved.apply(pose[:3, 3])
         found.append(GivenCamera(camera.attrib["label"], lenses[number], pose))
-    return found
+    return found, notes
 
 
 def metashape_place(file: Path) -> Place | None:
@@ -56,7 +55,7 @@ def metashape_place(file: Path) -> Place | None:
     Raises:
         StageError: its CRS is none that is known, or one in which no cloud can lie.
     """
-    chunk = _chunk(file)
+    chunk, _ = _chunk(file)
     reference, earth_from_chunk = (chunk.findtext("reference") or "").strip(), _outside_from_chunk(chunk)
     if earth_from_chunk is None or not reference or reference.startswith(LOCAL) or not _on_earth(earth_from_chunk):
         return None
@@ -72,24 +71,34 @@ def metashape_place(file: Path) -> Place | None:
     return Place(earth_from_chunk, True, crs)
 
 
-def _chunk(file: Path) -> ET.Element:
-    """The project's part of its XML; one with a document type is not parsed, for its entities may grow without end."""
+def _chunk(file: Path) -> tuple[ET.Element, list[str]]:
+    """The chunk with most photos of those that are not disabled, and a note where there are others.
+
+    An XML with a document type is not parsed, for its entities may grow without end.
+    """
     text = read_text(file)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("it has a document type, which Metashape's files have not")
-    chunk = ET.fromstring(text).find(".//chunk")
-    if chunk is None:
-        raise ValueError("it has no chunk")
-    return chunk
+    chunks = list(ET.fromstring(text).iterfind(".//chunk"))
+    enabled = {f"{k} ({chunk.get('label', 'chunk')})": chunk for k, chunk in enumerate(chunks, 1) if _enabled(chunk)}
+    if not enabled:
+        raise ValueError("it has no chunk that is enabled")
+    name, notes = largest({name: _aligned(chunk) for name, chunk in enabled.items()})
+    return enabled[name], notes
 
 
-def _cameras_of(chunk: ET.Element) -> list[ET.Element]:
-    """Its cameras that are not disabled, of the active component: those of others lie somewhere else."""
+def _enabled(part: ET.Element) -> bool:
+    return part.get("enabled", "true") not in ("false", "0")
+
+
+def _aligned(chunk: ET.Element) -> list[ET.Element]:
+    """Its cameras that have a pose and are not disabled, of the active component: others lie somewhere else."""
     active = _active(chunk)
     return [
         camera
         for camera in chunk.iterfind("cameras//camera")
-        if camera.attrib.get("enabled", "true") not in ("false", "0")
+        if _enabled(camera)
+        and camera.findtext("transform")
         and (active is None or camera.attrib.get("component_id", active) == active)
     ]
 

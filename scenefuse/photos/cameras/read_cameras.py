@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines, read_text
 from scenefuse.core.transforms import Array
-from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, PosedPhoto, colmap_camera
+from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, PosedPhoto, colmap_camera, largest
 from scenefuse.photos.cameras.json_cameras import TRANSFORMS, find_opensfm, opensfm_place, read_opensfm, read_transforms
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
 from scenefuse.photos.photo_files import BUNDLER, bundler_list, colmap_models, files_by_name, stored_size
@@ -111,16 +111,16 @@ def _format_of(cameras: Path) -> tuple[Path, str]:
 
 def _read(file: Path, program: str) -> tuple[list[GivenCamera], list[str]]:
     """The cameras of a file, or of a folder with COLMAP models; of several models those of the largest, and a note."""
-    readers = {"Metashape": read_metashape, "Bundler": _read_bundler}
+    if program == "Metashape":
+        return _tried(read_metashape, file, program)
     if program == "COLMAP":
         models = {str(m.relative_to(file)): _tried(read_colmap, m, program) for m in colmap_models(file)}
     elif program == "OpenSfM":
         models = _tried(read_opensfm, file, program)
     else:
-        return _tried(readers.get(program, read_transforms), file, program), []
-    (name, largest), *others = sorted(models.items(), key=lambda model: -len(model[1])) or [("", [])]
-    counts = ", ".join(f"{other} with {len(given)}" for other, given in others)
-    return largest, [f"the model {name} is taken, with {len(largest)} photos, and not {counts}"] if others else []
+        return _tried(_read_bundler if program == "Bundler" else read_transforms, file, program), []
+    name, notes = largest(models)
+    return models.get(name, []), notes
 
 
 def _tried(reader: Callable[[Path], Found], file: Path, program: str) -> Found:
