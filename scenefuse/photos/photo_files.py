@@ -4,6 +4,7 @@ workflow lists them often."""
 from __future__ import annotations
 
 import os
+import re
 import struct
 import unicodedata
 from collections import Counter, defaultdict
@@ -20,13 +21,16 @@ if TYPE_CHECKING:
 
 # Positions of the photos beside it, as OpenDroneMap names the file.
 GEO_FILE = "geo.txt"
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+JPEG = (".jpg", ".jpeg", ".jpe", ".jfif")
+SUFFIXES = (*JPEG, ".png", ".tif", ".tiff", ".bmp", ".ppm")
 VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts"}
 # Photos all the same, but in formats that not every stage can decode.
 UNREADABLE = frozenset(
     (".heic", ".heif", ".avif", ".jxl", ".webp", ".dng", ".raw", ".3fr", ".arw", ".cr2", ".cr3", ".crw")
 )
 UNREADABLE |= frozenset((".gpr", ".iiq", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f"))
+UNREADABLE |= frozenset((".hif", ".mpo", ".jp2", ".j2k", ".jpx", ".gif", ".insp", ".tga", ".dib", ".pgm", ".pnm"))
+UNREADABLE |= frozenset((".rwl", ".sr2", ".mef", ".mrw", ".erf", ".kdc", ".dcr", ".fff"))
 
 # Phones' photos have 200 million pixels. A small file that claims more would fill the memory.
 MAX_PIXELS = 250_000_000
@@ -43,8 +47,8 @@ MODEL_FILES = tuple(f"{name}.{kind}" for name in ("cameras", "images") for kind 
 BUNDLER = ".out"
 # Where in an OpenDroneMap project its place on the earth is.
 COORDS = "odm_georeferencing/coords.txt"
-# What the name of a mask may have more than its photo's.
-MASK = "_mask"
+# What the name of a mask may have more than its photo's: a_mask, a.jpg.mask, a-mask, mask_a.
+MASK = re.compile(r"(.+)[_.-]mask|mask[_.-](.+)", re.DOTALL)
 # What to do about names that do not tell photos apart.
 RENAME = "give the folder that holds the photos alone, or every photo a name of its own"
 
@@ -71,9 +75,12 @@ def colmap_models(given: Path) -> list[Path]:
 
 def bundler_list(file: Path) -> Path | None:
     """The list of photos beside a Bundler file, by its usual names; None where there is none."""
-    names = (f"{file.stem}.list.txt", f"{file.stem}.lst", f"{file.stem}.txt", "list.txt", "images.list")
-    beside = (file.with_name(name) for name in names)
-    return next((path for path in beside if path.is_file()), None) if file.suffix == BUNDLER else None
+    if file.suffix.lower() != BUNDLER:
+        return None
+    stem = file.stem.casefold()
+    names = (f"{stem}.list.txt", f"{stem}.lst", f"{stem}.txt", "list.txt", "images.list")
+    beside = {path.name.casefold(): path for path in sorted(file.parent.iterdir(), reverse=True) if path.is_file()}
+    return next((beside[name] for name in names if name in beside), None)
 
 
 def photo_files(folder: Path) -> list[Path]:
@@ -124,13 +131,20 @@ def files_by_name(names: Iterable[str], folder: Path, where: str) -> dict[str, P
 
 
 def masks_by_name(photos: Iterable[str], folder: Path) -> dict[str, Path]:
-    """The masks below a folder by the names of their photos; those named `_mask` alone where there are any."""
-    files = pictures_below(folder)
-    marked = {name: path for name, path in files.items() if path.stem.endswith(MASK)} or files
-    return {photo: marked[name] for photo, name in photos_by_name(photos, marked, str(folder), MASK).items()}
+    """The masks below a folder by the names of their photos: for each photo the one that is named as a mask, else the
+    one named like the photo; where the folder has both kinds, a file of a photo's whole name is this photo itself."""
+    files, photos = pictures_below(folder), list(photos)
+    marked = [name for name, path in files.items() if MASK.fullmatch(path.stem.casefold())]
+    found = photos_by_name(photos, marked, str(folder), MASK)
+    whole = {key for photo in photos if found for key in _keys(photo)[1:2]}
+    plain = [name for name in files if name not in found.values() and whole.isdisjoint(_keys(name))]
+    found |= photos_by_name([photo for photo in photos if photo not in found], plain, str(folder))
+    return {photo: files[name] for photo, name in found.items()}
 
 
-def photos_by_name(wanted: Iterable[str], known: Iterable[str], where: str, mark: str = "") -> dict[str, str]:
+def photos_by_name(
+    wanted: Iterable[str], known: Iterable[str], where: str, mark: re.Pattern[str] | None = None
+) -> dict[str, str]:
     """Which photo is meant by each name that another program, a list or a person gives; those not there are left out.
 
     Names are compared from their end, folder by folder, as far as they agree: other machines' paths, and frames with
@@ -142,7 +156,7 @@ def photos_by_name(wanted: Iterable[str], known: Iterable[str], where: str, mark
         wanted: names as given.
         known: paths of photos below their folder.
         where: the file that gives the names, for messages.
-        mark: what names of `known` may have before their ending, as those of masks do.
+        mark: what names of `known` may be besides their endings, as those of masks are; its groups are a photo's.
 
     Raises:
         StageError: a name may be of several photos, or a photo of several names.
@@ -192,20 +206,25 @@ def _shared_folders(one: str, other: str) -> int:
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def _keys(name: str, mark: str = "") -> list[_Key]:
+def _keys(name: str, mark: re.Pattern[str] | None = None) -> list[_Key]:
     """What names have in common that may be of one photo: three keys of the whole name, then of less and less of it."""
     parts = _parts(name)
+    *folders, last = [part.casefold() for part in parts] or [""]
+    stem = _stem(last, mark)
     keys: list[_Key] = []
     for k in range(len(parts)):
         spelled = "_".join(parts[k:])
         folded = spelled.casefold()
-        stem, before = folded, ""
-        while stem != before:
-            before = stem
-            ending = next((e for e in (*SUFFIXES, *UNREADABLE) if stem.endswith(e)), "")
-            stem = stem.removesuffix(ending).removesuffix(mark) or stem
-        keys += [("spelled", spelled), ("folded", folded), ("stem", stem)]
+        keys += [("spelled", spelled), ("folded", folded), ("stem", "_".join([*folders[k:], stem]))]
     return keys
+
+
+def _stem(name: str, mark: re.Pattern[str] | None) -> str:
+    """A name without its endings, however many, and without a mark."""
+    while (path := Path(name)).suffix in (*SUFFIXES, *UNREADABLE):
+        name = path.stem
+    marked = mark.fullmatch(name) if mark else None
+    return name if marked is None else _stem(marked[1] or marked[2], None)
 
 
 def in_folders(names: list[str]) -> str:

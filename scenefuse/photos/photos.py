@@ -13,7 +13,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, value, write_json
-from scenefuse.photos.photo_files import GEO_FILE, in_folders, open_picture, photo_files
+from scenefuse.photos.photo_files import GEO_FILE, JPEG, in_folders, open_picture, photo_files
 from scenefuse.photos.pictures import JPEG_QUALITY, read_raw, stretched
 from scenefuse.photos.positions import exif_number, exif_text, positions_of, read_geo, stated_position
 
@@ -185,9 +185,7 @@ def save_upright(folder: Path, photo: Photo, target: Path, bits: int = 0, max_wi
         if max_width_px is not None and width > max_width_px:
             size = max_width_px, max(round(height * max_width_px / width), 1)
             upright = upright.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
-        coded: dict[str, Any] = (
-            {"quality": JPEG_QUALITY, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
-        )
+        coded: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if target.suffix.lower() in JPEG else {}
         upright.save(target, exif=exif.tobytes(), **coded)
     focal_px = photo.focal_px and photo.focal_px * max(upright.size) / max(width, height)
     seen: dict[str, Any] = {"width": upright.width, "height": upright.height, "sha256": sha256(target)}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
-from scenefuse.photos.photo_files import stored_size
+from scenefuse.photos.photo_files import JPEG, stored_size
 
 # Loses nothing that SIFT or a mask would notice.
 JPEG_QUALITY = 97
@@ -61,9 +61,10 @@ def write_picture(path: Path, pixels: NDArray[np.uint8]) -> None:
     """
     path = Path(path)
     stored = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if path.suffix.lower() in (".jpg", ".jpeg") else []
+    jpeg = path.suffix.lower() in JPEG
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if jpeg else []
     try:
-        content = cv2.imencode(path.suffix, stored, options)[1]
+        content = cv2.imencode(JPEG[0] if jpeg else path.suffix, stored, options)[1]
     except cv2.error:
         raise StageError(f"{path} has an ending of no known picture; give .png or .jpg") from None
     path.write_bytes(content.tobytes())

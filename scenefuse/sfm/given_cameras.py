@@ -20,7 +20,7 @@ from scenefuse.core.transforms import Array
 from scenefuse.photos.cameras.given import PosedPhoto, at_size, possible_turns
 from scenefuse.photos.cameras.json_cameras import PERSPECTIVE
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
-from scenefuse.photos.photo_files import frame_name, masks_by_name, pictures_below, stored_size
+from scenefuse.photos.photo_files import JPEG, frame_name, masks_by_name, pictures_below, stored_size
 from scenefuse.photos.photos import (
     SHAPE_TOLERANCE,
     bits_to_stretch,
@@ -240,7 +240,7 @@ def _write_photo(
         name = photo.name
         shutil.copyfile(photo.file, images / name)
     else:
-        jpeg = Path(photo.name).suffix.lower() in (".jpg", ".jpeg")
+        jpeg = Path(photo.name).suffix.lower() in JPEG
         name = photo.name if jpeg and not exact else f"{stem}.png"
         picture = _bled(picture, matte) if exact else picture
         write_picture(images / name, picture if straight else undistort_picture(picture, camera, view))
@@ -281,7 +281,7 @@ def no_match(folder: Path, photo: str) -> str:
     masks = pictures_below(folder)
     return (
         f"masks that match no photo: {len(masks)} masks in {folder} (first: {next(iter(masks), 'none')}), photos are"
-        f" named like {photo}; name a mask like its photo, with or without _mask"
+        f" named like {photo}; name a mask like its photo, with or without _mask behind it"
     )
 
 

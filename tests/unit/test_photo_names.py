@@ -65,8 +65,45 @@ def test_a_photo_that_is_gone_is_not_taken_from_another_folder():
     assert photos_by_name(["images/1.png", "images/2.png"], known, "") == {"images/1.png": "images/1.png"}
 
 
+@pytest.mark.parametrize(
+    "mask",
+    [
+        "b.JPG.png",
+        "b_mask.png",
+        "b.JPG_mask.png",
+        "b.JPG.mask.png",
+        "b.mask.png",
+        "b-mask.JPG",
+        "Mask_b.png",
+        "x/b.jpe",
+    ],
+)
+def test_a_mask_may_be_named_as_any_program_names_it(tmp_path, mask):
+    (tmp_path / mask).parent.mkdir(exist_ok=True)
+    (tmp_path / mask).touch()
+    assert masks_by_name(["a.JPG", "b.JPG"], tmp_path) == {"b.JPG": tmp_path / mask}
+
+
+def test_photos_whose_names_begin_or_end_as_those_of_masks_have_masks(tmp_path):
+    for name in ("mask_1.png", "mask_2_mask.png", "face_mask.png"):
+        (tmp_path / name).touch()
+    found = masks_by_name(["mask_1.jpg", "mask_2.jpg", "face_mask.jpg"], tmp_path)
+    assert {photo: mask.name for photo, mask in found.items()} == {
+        "mask_1.jpg": "mask_1.png",
+        "mask_2.jpg": "mask_2_mask.png",
+        "face_mask.jpg": "face_mask.png",
+    }
+
+
+def test_one_mask_that_is_named_otherwise_hides_no_other(tmp_path):
+    for name in ("1.png", "2.png", "2_mask.png", "3.png"):
+        (tmp_path / name).touch()
+    found = masks_by_name(["1.jpg", "2.jpg", "3.jpg"], tmp_path)
+    assert [found[photo].name for photo in ("1.jpg", "2.jpg", "3.jpg")] == ["1.png", "2_mask.png", "3.png"]
+
+
 def test_masks_are_found_by_their_photos_names(tmp_path):
-    for name in ("a.jpg", "a_mask.PNG", "sub/b.JPG_mask.png", "c.png"):
+    for name in ("a.jpg", "a_mask.PNG", "sub/b.JPG", "sub/b.JPG_mask.png", "c.jpg"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     found = masks_by_name(["a.jpg", "sub_b.JPG", "c.jpg"], tmp_path)

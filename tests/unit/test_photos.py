@@ -3,17 +3,19 @@ import os
 import resource
 import struct
 import zlib
+from dataclasses import replace
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image, TiffImagePlugin
 
 import scenefuse.photos.photo_files
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.photos.photo_files import photo_files, stored_size, upright_size
-from scenefuse.photos.photos import check_unchanged, inspect_photo, list_photos, read_photos
-from scenefuse.photos.pictures import read_gray, read_raw, write_depth, write_picture
+from scenefuse.photos.photos import check_unchanged, inspect_photo, list_photos, read_photos, save_upright
+from scenefuse.photos.pictures import read_gray, read_raw, read_rgb, write_depth, write_picture
 from scenefuse.photos.positions import stated_position
 
 
@@ -157,7 +159,20 @@ def test_photos_in_symlinked_folders_are_found_once(tmp_path):
     assert photo_files(tmp_path / "p") == [tmp_path / "p" / "flight" / "a.jpg"]
 
 
-@pytest.mark.parametrize("name", ["IMG_1.HEIC", "DJI_0001.DNG", "sub/shot.NEF"])
+@pytest.mark.parametrize("ending", ["jpe", "JFIF", "ppm"])
+def test_photos_in_less_common_formats_are_read_by_all_who_read_photos(tmp_path, ending):
+    name = f"a.{ending}"
+    write_picture(tmp_path / name, np.full((30, 40, 3), (200, 100, 50), np.uint8))
+    photo = inspect_photo(tmp_path, photo_files(tmp_path)[0].name)
+    assert save_upright(tmp_path, replace(photo, orientation=6), tmp_path / f"b.{ending}").width == 40
+    for path in (tmp_path / name, tmp_path / f"b.{ending}"):
+        assert abs(read_rgb(path)[5, 5].astype(int) - [200, 100, 50]).max() <= 2
+        assert pycolmap.Bitmap.read(path, True).width == 40
+
+
+@pytest.mark.parametrize(
+    "name", ["IMG_1.HEIC", "DJI_0001.DNG", "sub/shot.NEF", "c.hif", "c.MPO", "c.jp2", "c.gif", "c.insp", "c.tga"]
+)
 def test_photos_that_cannot_be_read_are_named(tmp_path, name):
     save(tmp_path / "p" / "a.jpg")
     save(tmp_path / "p" / "sub" / "b.jpg")
