@@ -17,6 +17,7 @@ from scenefuse.core.settings import (
     problem,
     problem_at,
     read_differences,
+    read_yaml,
     schema_of,
     with_defaults,
 )
@@ -69,7 +70,9 @@ def read_project(config: Mapping[str, Any], files: Iterable[Path] = ()) -> Proje
     Raises:
         StageError: the first thing that is wrong, with its file and place.
     """
-    schema = schema_of("config")
+    files, schema = list(files), schema_of("config")
+    for file in (file for file in files if file.suffix != ".json"):
+        read_yaml(file)
     keys, wrong = problem_at(config, schema)
     if wrong:
         raise StageError(f"{next(filter(None, (place_of(keys, file) for file in files)), 'config')}, {wrong}")

@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -21,6 +22,27 @@ OWN_SETTINGS = Path("config/config.yaml")
 # More values than any settings file has; messages about fewer are still short.
 MAX_VALUES = 10_000
 T = TypeVar("T")
+# A JSON schema's validator to which NaN and infinity are no numbers.
+_Validator = jsonschema.validators.extend(
+    jsonschema.Draft202012Validator,
+    type_checker=jsonschema.Draft202012Validator.TYPE_CHECKER.redefine(
+        "number", lambda _, x: isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x)
+    ),
+)
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """Refuses a key that stands twice in a mapping; YAML's other readers take the last, and lose the first."""
+
+    def compose_mapping_node(self, anchor: dict[Any, yaml.Node]) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        lines = dict[str, int]()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in lines:
+                twice = f"the key '{key.value}' stands in line {lines[key.value]} already; bring both together"
+                raise yaml.MarkedYAMLError(problem=twice, problem_mark=key.start_mark)
+            lines[key.value] = key.start_mark.line + 1
+        return node
 
 
 def merge(base: Any, over: Any) -> Any:
@@ -47,7 +69,7 @@ def problem_at(content: Any, schema: Mapping[str, Any]) -> tuple[list[Any], str 
     """The keys that lead to what `problem` says, and its sentence; None where nothing is wrong."""
     if _grows(content):
         return [], "aliases of YAML expand without end; write what they stand for"
-    for error in jsonschema.Draft202012Validator(schema).iter_errors(content):
+    for error in _Validator(schema).iter_errors(content):
         keys, message = list(error.absolute_path), error.message
         where = ".".join(map(str, keys))
         if error.validator == "additionalProperties":
@@ -56,6 +78,8 @@ def problem_at(content: Any, schema: Mapping[str, Any]) -> tuple[list[Any], str 
             close = difflib.get_close_matches(str(unknown), known, 1)
             advice = f"did you mean '{close[0]}'?" if close else f"known keys are: {', '.join(known)}"
             keys, message = [*keys, unknown], f"unknown key '{unknown}'; {advice}"
+        elif error.validator == "type" and error.instance is None:
+            message = "nothing stands behind or below it; remove the line, or fill it in"
         elif error.validator == "pattern" and "advice" in error.schema:
             message = f"'{error.instance}' will not do; {error.schema['advice']}"
         return keys, f"{where}: {message}" if where else message
@@ -92,10 +116,10 @@ def read_settings(*mine: Path | None) -> dict[str, Any]:
     return with_defaults(functools.reduce(merge, own, {}), schema_of("config"))
 
 
-def read_differences(mine: Path) -> dict[str, Any]:
-    """The settings that a file names, checked; errors as of `read_settings`."""
+def read_yaml(mine: Path) -> Any:
+    """The content of a settings file in YAML, in which no key stands twice; errors as of `read_settings`."""
     try:
-        own = yaml.safe_load(mine.read_text()) or {}
+        return yaml.load(mine.read_text(), _UniqueKeys)
     except OSError:
         raise StageError(f"the settings file {mine} cannot be read; correct its path") from None
     except yaml.MarkedYAMLError as error:
@@ -103,6 +127,11 @@ def read_differences(mine: Path) -> dict[str, Any]:
         raise StageError(f"{mine} is no YAML ({line}{error.problem}); correct it") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise StageError(f"{mine} is no YAML ({' '.join(str(error).split())}); correct it") from None
+
+
+def read_differences(mine: Path) -> dict[str, Any]:
+    """The settings that a file names, checked; errors as of `read_settings`."""
+    own = read_yaml(mine) or {}
     if not isinstance(own, dict):
         raise StageError(f"{mine} holds no settings; write keys as in config/config.yaml, `registration:` first")
     keys, wrong = problem_at(own, schema_of("config"))

@@ -4,6 +4,7 @@ import codecs
 import csv
 import io
 import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from scenefuse.core.stage import StageError
@@ -24,7 +25,7 @@ def read_table(path: Path, key: str) -> dict[str, Row]:
             cells, or two rows have the same key.
     """
     lines = [line for line in io.StringIO(read_text(path), newline=None) if not _is_comment(line)]
-    written = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter="\t")]
+    written = [[cell.strip() for cell in row] for row in _split(lines, path)]
     header, *cells = [row for row in written if any(row)] or [[]]
     header = _cells(header)
     if key not in header:
@@ -68,10 +69,20 @@ def read_cells(path: Path) -> list[tuple[int, list[str]]]:
     """
     rows = []
     for number, line in read_lines(path):
-        cells = _cells(next(csv.reader([line], delimiter="\t")))
+        cells = _cells(next(_split([line], path)))
         if cells:
             rows.append((number, cells))
     return rows
+
+
+def _split(lines: Iterable[str], path: Path) -> Iterator[list[str]]:
+    """The rows of tab-separated lines; StageError where a cell begins with a quote that takes others into it."""
+    for row in csv.reader(lines, delimiter="\t"):
+        broken = next((cell for cell in row if re.search("[\t\n]", cell)), None)
+        if broken is not None:
+            begin = re.split("[\t\n]", broken)[0]
+            raise StageError(f'{path}: no quote ends the cell that begins with "{begin}; remove the quote before it')
+        yield row
 
 
 def _is_comment(line: str) -> bool:
@@ -104,7 +115,14 @@ def read_text(path: Path) -> str:
     except OSError:
         raise StageError(f"{path} does not exist or cannot be read; write it, or correct its path") from None
     marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    # DOS ends text with ^Z.
+    content = content if marked else content.rstrip(b"\x1a")
+    if content.startswith((b"PK\3\4", b"\xd0\xcf\x11\xe0")):
+        raise StageError(f"{path} is a spreadsheet or an archive, whatever its name; save it as tab-separated text")
     if b"\0" in content and not marked:
+        # Every second byte of ASCII in UTF-16 is zero.
+        if (b"\0" in content[::2]) == (b"\0" in content[1::2]):
+            raise StageError(f"{path} is no text, it holds binary data; give a text file")
         raise StageError(f"{path} is not UTF-8 text (it looks like UTF-16); save the file as UTF-8")
     try:
         return content.decode("utf-16" if marked else "utf-8-sig")

@@ -211,6 +211,20 @@ def test_init_ends_with_the_next_command_by_its_real_names(two_folders, capsys):
         ("seed: 1\nobject:\n  nerf:\n    widht: 3\n", "line 4, object.nerf: unknown key 'widht'; did you mean 'width'"),
         ("seed: 1\nobject: { nerf: { width: x } }\n", "line 2, object.nerf.width: 'x' is not of type 'integer'"),
         ("registration:\n  variants: [full, 3]\n", "line 2, registration.variants.1: 3 is not of type"),
+        (
+            "scene:\n  # fast: true\nseed: 1\n",
+            "line 1, scene: nothing stands .* below it; remove the line, or fill it in",
+        ),
+        ("seed: 1\nregistration:\n  crop:\n    margin: .nan\n", "line 4, registration.crop.margin: nan is not of type"),
+        ("registration: {crop: {margin: -.inf}}", "line 1, registration.crop.margin: -inf is not of type"),
+        (
+            "object: {seed: 1}\nseed: 1\nobject:\n  nerf: {}\n",
+            r" is no YAML \(line 3: the key 'object' stands in line 1 already",
+        ),
+        (
+            "object:\n  nerf:\n    levels: 8\n    levels: 9\n",
+            r" is no YAML \(line 4: the key 'levels' stands in line 3",
+        ),
         ("seed: 1\nobject: {\n", r" is no YAML \(line 3: expected the node content"),
     ],
 )

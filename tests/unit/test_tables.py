@@ -55,6 +55,10 @@ def test_unicode_with_and_without_a_mark_is_read(table, encoding):
     assert read_table(path, "object")["shed"]["photos"] == "Gärten"
 
 
+def test_the_mark_at_the_end_of_a_dos_text_is_no_row(table):
+    assert list(read_table(table("object\nshed\n\x1a"), "object")) == ["shed"]
+
+
 def test_big_endian_unicode_is_read(tmp_path):
     (tmp_path / "a.tsv").write_bytes(codecs.BOM_UTF16_BE + "object\nshed\n".encode("utf-16-be"))
     assert list(read_table(tmp_path / "a.tsv", "object")) == ["shed"]
@@ -78,9 +82,25 @@ def test_another_encoding_is_named_with_its_file(table, encoding, sentence):
         ("object\tobject\nshed\tshed\n", "two columns 'object'"),
         ("object\tphotos\nshed\n", "row 1: 1 columns, and the header has 2; separate them by tabs"),
         ("object\tphotos\nshed\ta\nbarn\ta\tb\n", "row 2: 3 columns, and the header has 2"),
+        ('object\tphotos\n"shed\ta\nbarn\tb\n', 'no quote ends the cell that begins with "shed; remove the quote'),
+        ('object\tphotos\nshed\t"a\nbarn\tb\n', 'no quote ends the cell that begins with "a; remove the quote'),
+        ("PK\3\4\0\0\0", "is a spreadsheet or an archive, whatever its name; save it as tab-separated text"),
+        ("SQLite format 3\0\0\0", "is no text, it holds binary data; give a text file"),
         ("object\tphotos\nshed\ta\nshed\tb\n", "'shed' stands in two rows; names must differ"),
     ],
-    ids=["no such column", "semicolons", "empty", "column twice", "too few", "too many", "name twice"],
+    ids=[
+        "no such column",
+        "semicolons",
+        "empty",
+        "column twice",
+        "too few",
+        "too many",
+        "quote",
+        "last quote",
+        "xlsx",
+        "binary",
+        "name twice",
+    ],
 )
 def test_a_bad_table_is_one_sentence_with_its_file(table, text, sentence):
     with pytest.raises(StageError, match=f"objects.tsv.*{sentence}"):
@@ -234,6 +254,12 @@ def test_a_bad_setting_is_one_sentence_with_its_key(project, changes, sentence):
 def test_a_bad_row_is_one_sentence_with_its_table(project, rows, sentence):
     with pytest.raises(StageError, match=sentence):
         project(**rows)
+
+
+def test_a_section_that_stands_twice_is_named_where_snakemake_has_read_the_file(tmp_path):
+    (tmp_path / "mine.yaml").write_text("object: {recipe: paper}\nobject: {cloud: {}}\n")
+    with pytest.raises(StageError, match=r"mine\.yaml is no YAML \(line 2: the key 'object' stands in line 1 already"):
+        read_project({"object": {"cloud": {}}}, [tmp_path / "mine.yaml"])
 
 
 @pytest.fixture
