@@ -19,6 +19,7 @@ from scenefuse.register.score import (
     Hypothesis,
     color_agreement,
     distinct,
+    lead,
     pair,
 )
 from scenefuse.register.uncertainty import Uncertainty
@@ -84,7 +85,7 @@ class Decision:
         reason: one sentence why.
         decided_by: `geometry`, `near` (the clouds' pose, close to an alignment that the scene's photos rule out),
             `photos` (the alignment from shared features replaced the clouds' pose) or `both` (they agree).
-        margin: relative lead over the best rival, at most 1; negative where the rival is better.
+        margin: `lead` over the best rival; 1 without one.
         rival: the best pose that differs and would leave the object elsewhere, or None.
         free_axis: unit vector (3,) in the scene about which the object can turn and stay the same, or None.
     """
@@ -126,7 +127,7 @@ def decide(
     rivals, free_axis = _rivals(best, rest, obj, problem.scene.diagonal, settings, repetition.same_shift)
     rival = rivals[0] if rivals else None
     # The alignment's pose may score less than a rival: then there is no lead.
-    margin = 1.0 if rival is None else 1 - rival.score.total / max(best.score.total, 1e-12)
+    margin = 1.0 if rival is None else lead(best.score.total, rival.score.total)
     by_clouds = decided_by in ("geometry", "near")
     of_clouds = _reasons_of_clouds(best, margin, repetition, problem, settings) if by_clouds else ()
     of_spread = _reasons_of_spread(free_axis, uncertainty, problem.scene.diagonal, settings)

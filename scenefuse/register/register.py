@@ -23,7 +23,7 @@ from scenefuse.register.fine import AgreementSettings, pose_quantities, registra
 from scenefuse.register.places import MAX_PLACES, likely_places
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, estimates, prior
 from scenefuse.register.refinement import Outcome, refine_hypotheses
-from scenefuse.register.score import DISTINCT_SHIFT, Hypothesis
+from scenefuse.register.score import DISTINCT_SHIFT, Hypothesis, lead
 from scenefuse.register.uncertainty import uncertainty_quantities
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
@@ -276,7 +276,7 @@ def _unless_elsewhere(
     rival = max(elsewhere, key=lambda other: other.total, default=None)
     if rival is None or rival.scene_from_object is None:
         return found
-    margin = min(outcome.decision.margin, 1 - rival.total / max(found.total, 1e-12))
+    margin = min(outcome.decision.margin, lead(found.total, rival.total))
     found = replace(found, outcome=replace(outcome, decision=replace(outcome.decision, margin=margin)))
     if margin >= settings.min_margin:
         return found

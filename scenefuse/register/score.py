@@ -51,6 +51,11 @@ def worth(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> 
     return pairs, (1 - (pairs.distance / tau) ** 2) * np.clip(np.abs(facing), 0, 1)
 
 
+def lead(best: float, rival: float) -> float:
+    """Relative lead of a score over a rival's, -1..1; negative where the rival's is better."""
+    return (best - rival) / max(best, rival, 1e-12)
+
+
 def f_beta(precision: float, recall: float) -> float:
     """The F-score in which recall weighs more."""
     b = RECALL_WEIGHT**2
