@@ -27,7 +27,8 @@ def read_crs(text: str, where: str) -> pyproj.CRS:
     Raises:
         StageError: `text` names none, or what `usable` says.
     """
-    return usable(_named(text, f"{where}, in its first line"), where)
+    # A spreadsheet fills the row up with empty cells.
+    return usable(_named(text.strip().rstrip(",;\t ").strip('"'), f"{where}, in its first line"), where)
 
 
 def projected_crs(text: str, where: str, heights: bool) -> pyproj.CRS:

@@ -17,8 +17,8 @@ from scenefuse.core.tables import comma_advice, read_lines
 from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3, along_a_line
 from scenefuse.marks.clicks import Click, in_photos
 from scenefuse.marks.triangulation import MAX_CLICK_MISS, intersect, model_pixel, read_ends
-from scenefuse.photos.photo_files import SUFFIXES
 from scenefuse.photos.photos import Photo
+from scenefuse.photos.positions import cells_of
 
 if TYPE_CHECKING:
     import pycolmap
@@ -84,26 +84,13 @@ def read_control(path: Path) -> ControlFile:
     crs = read_crs(lines[0][1] if lines else "", str(path))
     rows: dict[str, list[Row]] = {}
     for number, line in lines[1:]:
-        name, row = _row(_cells(line.strip()), f"{path}, line {number}")
+        name, row = _row(cells_of(line, MIN_CELLS - 1, MIN_CELLS), f"{path}, line {number}")
         rows.setdefault(name, []).append(row)
     if not rows:
         raise StageError(f"{path} holds no points below its first line; write lines {LAYOUT}")
     positions = to_wgs84(crs, np.array([clicks[0][0] for clicks in rows.values()]), str(path))
     points = [_point(name, clicks, place, path) for (name, clicks), place in zip(rows.items(), positions)]
     return ControlFile(path, crs, points)
-
-
-def _cells(line: str) -> list[str]:
-    """The columns of a line; between blanks, a photo's name that holds some ends where a photo's ending does."""
-    blank = len(line.split()) >= MIN_CELLS and not line.split()[0].endswith((",", ";"))
-    marks = "\t" if blank else "\t;,"
-    mark = next((mark for mark in marks if line.count(mark) >= MIN_CELLS - 1), None)
-    cells = [cell.strip() for cell in line.split(mark)]
-    if mark is None:
-        ends = (k for k, cell in enumerate(cells) if k >= MIN_CELLS - 1 and Path(cell).suffix.lower() in SUFFIXES)
-        last = next(ends, MIN_CELLS - 1)
-        cells[MIN_CELLS - 1 : last + 1] = [" ".join(cells[MIN_CELLS - 1 : last + 1])]
-    return cells
 
 
 def unknown_photo(path: Path, point: str, photo: str, names: Collection[str]) -> StageError:
@@ -117,7 +104,7 @@ def unknown_photo(path: Path, point: str, photo: str, names: Collection[str]) ->
 def _row(cells: list[str], where: str) -> tuple[str, Row]:
     """Name of the point; its coordinates, standard deviations, photo and pixel."""
     try:
-        numbers = np.array([float(cell) for cell in cells[:5]])
+        numbers = np.array([float(cell or "nan") for cell in cells[:5]])
         photo = cells[5]
         if not (np.isfinite(numbers[[0, 1, 3, 4]]).all() and photo):
             raise ValueError

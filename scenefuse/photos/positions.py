@@ -10,9 +10,9 @@ import numpy as np
 
 from scenefuse.cloud.crs import read_crs, to_wgs84
 from scenefuse.core.stage import StageError
-from scenefuse.core.tables import read_lines
+from scenefuse.core.tables import comma_advice, read_lines
 from scenefuse.core.transforms import Array
-from scenefuse.photos.photo_files import photos_by_name
+from scenefuse.photos.photo_files import SUFFIXES, photos_by_name
 
 LAYOUT = "photo x y [z [yaw pitch roll [horizontal sd [vertical sd]]]]"
 
@@ -159,7 +159,8 @@ def _positive(pattern: re.Pattern[bytes], xmp: bytes) -> float | None:
 
 
 def read_geo(path: Path) -> dict[str, Position]:
-    """Read a geo.txt: the CRS in the first line, then `photo x y [z [yaw pitch roll [sd [vertical sd]]]]`.
+    """Read a geo.txt: the CRS in the first line, then `photo x y [z [yaw pitch roll [sd [vertical sd]]]]`
+    between tabs, semicolons, commas or blanks.
 
     Returns:
         Photo name -> position. Angles are not used; a standard deviation of 0 is an unknown one.
@@ -172,13 +173,15 @@ def read_geo(path: Path) -> dict[str, Position]:
     names: list[str] = []
     rows: list[list[float]] = []
     for number, line in lines[1:]:
-        cells = [cell.strip() for cell in line.split("\t")] if "\t" in line.strip() else line.split()
+        cells = cells_of(line, 0, 3)
         try:
-            values = [float(cell) for cell in cells[1:9]]
+            values = [float(cell or "nan") for cell in cells[1:9]]
             if len(values) < 2 or not np.isfinite(values[:2]).all():
                 raise ValueError
         except ValueError:
-            raise StageError(f"{path}, line {number}: expected {LAYOUT}, got '{' '.join(cells)}'") from None
+            raise StageError(
+                f"{path}, line {number}: expected {LAYOUT}, got '{' '.join(cells)}'{comma_advice(cells[1:9])}"
+            ) from None
         if cells[0] in names:
             raise StageError(f"{path}, line {number}: {cells[0]} is given more than once; keep one line of it")
         names.append(cells[0])
@@ -188,6 +191,21 @@ def read_geo(path: Path) -> dict[str, Position]:
     table: Array = np.array(rows)
     places = to_wgs84(crs, table[:, :3], str(path))
     return {name: _position(place, row[6:8]) for name, place, row in zip(names, places, table)}
+
+
+def cells_of(line: str, photo: int, least: int) -> list[str]:
+    """The cells of a line of at least so many columns, with a photo's name in one and a number in the second.
+
+    Tabs, semicolons, commas or blanks separate them; between blanks, a name that holds some ends where a photo's ending
+    does.
+    """
+    for mark in "\t;,":
+        cells = [cell.strip(' \t"') for cell in line.strip().split(mark)]
+        if len(cells) >= least and (mark != "," or exif_number(cells[1]) is not None):
+            return cells
+    cells = line.split()
+    last = next((k for k in range(photo, len(cells)) if Path(cells[k]).suffix.lower() in SUFFIXES), photo)
+    return [*cells[:photo], " ".join(cells[photo : last + 1]), *cells[last + 1 :]]
 
 
 def positions_of(names: list[str], positions: dict[str, Position], path: Path) -> list[dict[str, Any]]:

@@ -17,7 +17,7 @@ from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.photos.geodesy import scene_frame
 from scenefuse.photos.photos import gps_accuracies, list_photos, read_photos
-from scenefuse.photos.positions import Position, positions_of
+from scenefuse.photos.positions import Position, positions_of, read_geo
 from scenefuse.sfm.mapping import in_metres
 
 FLIGHT = fly()
@@ -297,6 +297,29 @@ def test_columns_of_control_points_are_separated_in_any_way(tmp_path, mark, phot
     np.testing.assert_array_equal(point.clicks[0].pixel, [10.5, 20])
 
 
+@pytest.mark.parametrize("mark", ["\t", " ", ";", ",", ", ", "; "])
+@pytest.mark.parametrize("photo", ["a.jpg", "north side 2.JPG"])
+def test_columns_of_positions_are_separated_in_any_way(tmp_path, mark, photo):
+    (tmp_path / "geo.txt").write_text(
+        "EPSG:4326\n" + "".join(f"{mark.join([n, '8.5', '47.5', '400'])}\n" for n in (photo, "b.jpg"))
+    )
+    found = read_geo(tmp_path / "geo.txt")
+    assert list(found) == [photo, "b.jpg"]
+    assert (found[photo].latitude_deg, found[photo].longitude_deg, found[photo].altitude_m) == (47.5, 8.5, 400)
+
+
+@pytest.mark.parametrize(
+    ("first", "mark"), [("EPSG:4326,,,,,,", ","), ("EPSG:4326;;;;", ";"), ('"EPSG:4326"', ","), ("EPSG:4326\t\t", "\t")]
+)
+def test_what_a_spreadsheet_adds_to_the_first_line_does_no_harm(tmp_path, first, mark):
+    gcp, geo = ["8.5", "47.5", "", "10", "20", "a b.jpg", "p", ""], ["a b.jpg", '"8.5"', "47.5", "", ""]
+    for name, row in (("gcp_list.txt", gcp), ("geo.txt", geo)):
+        (tmp_path / name).write_text(f"{first}\n{mark.join(row)}\n")
+    (point,) = read_control(tmp_path / "gcp_list.txt").points
+    assert point.clicks[0].photo == "a b.jpg" and point.position[:2].tolist() == [47.5, 8.5]
+    assert read_geo(tmp_path / "geo.txt")["a b.jpg"].longitude_deg == 8.5
+
+
 def a_photo(folder, name, xmp=b"", orientation=1):
     folder.mkdir(exist_ok=True)
     exif = Image.Exif()
@@ -345,6 +368,8 @@ def test_a_geo_file_takes_the_place_of_exif(tmp_path, capsys):
     [
         ("a.jpg 8.5 47.4\n", "names no coordinate reference system"),
         ("EPSG:4326\na.jpg 8.5 north\n", "line 2: expected photo x y"),
+        ("EPSG:4326\na.jpg 8,5 47,4 400,1\n", "line 2: expected .*; 8,5 has a decimal comma, write 8.5"),
+        ("EPSG:4326\na.jpg;8,5;47,4\n", "line 2: expected .*; 8,5 has a decimal comma, write 8.5"),
         ("EPSG:4326\na.jpg 8.5 47.4\na.jpg 8.5 47.4\n", "given more than once"),
         ("EPSG:4326\nq.jpg 8.5 47.4\n", "names none of the photos"),
         ("EPSG:25832\na.jpg 5246000 466000\n", "x and y are swapped"),
