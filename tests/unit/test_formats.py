@@ -198,6 +198,16 @@ def test_where_colours_cannot_be_told_from_other_columns_there_are_none(tmp_path
         ("Point,Northing,Easting,Elevation,Code", "{k},{y},{x},{z},7"),
         ("Punkt;Rechtswert;Hochwert;Höhe", "P{k};{x};{y};{z}"),
         ("E N H", "{x} {y} {z}"),
+        ("Northing;Easting;Elevation", "{y};{x};{z};"),
+        ("Northing,Easting,Elevation,", "{y},{x},{z}"),
+        ("Northing\tEasting\tElevation\t", "{y}\t{x}\t{z}"),
+        ("Northing,Easting,Elevation", "{y} {x} {z}"),
+        ("Northing Easting Elevation", "{y},{x},{z}"),
+        ("Northing Easting Elevation", "P{k} {y} {x} {z}"),
+        ("N [m] E [m] H [m]", "{y} {x} {z}"),
+        ("Northing,Easting,Elevation\nm,m,m", "{y},{x},{z}"),
+        ("Northing (m)\tEasting (m)\tElevation (m)\tPoint Code", "{y}\t{x}\t{z}\ttree top"),
+        ("Y coord\tX coord\tZ coord", "{y}\t{x}\t{z}"),
     ],
 )
 def test_columns_by_their_surveyors_names(tmp_path, header, row):
@@ -206,6 +216,32 @@ def test_columns_by_their_surveyors_names(tmp_path, header, row):
     (tmp_path / "a.csv").write_text("\n".join([header, *lines]))
     assert np.array_equal(read_cloud(tmp_path / "a.csv").points, points)
     assert "y is " in "".join(text_notes(tmp_path / "a.csv"))
+
+
+def test_names_in_another_order_that_do_not_fit_the_rows_are_refused(tmp_path):
+    (tmp_path / "a.xyz").write_text("Y X Z\n" + "5 1.5 2 9\n" * 4)
+    with pytest.raises(StageError, match=r"'Y X Z' names 3 columns, but the rows have 4; give each column one name"):
+        read_cloud(tmp_path / "a.xyz")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"ncols 4\nnrows 2\nxllcorner 1\nyllcorner 2\ncellsize 1\n1 2 3 4\n5 6 7 8\n", "is a raster of heights"),
+        (b"DSAA\r\n4 2\r\n0 3\r\n0 1\r\n1 8\r\n1 2 3 4\r\n5 6 7 8\r\n", "is a raster of heights"),
+        (b"1\n1\n" + b"0 0 0\n" * 4 + b"1 0 0 0\n" * 4 + b"1 2 3 0.5\n", "is PTX, whose scans have poses"),
+        (b'x,y,z,r,g,b\n"431,000.1","5,400,000.2",2,1,2,3\n', r"\('431,000.1' is no number: write it without units"),
+        (b"431'000.1 5'400'000.2 200.1\n", r'"431\'000.1" is no number'),
+        (b"1.5 m;2.5 m;3.5 m\n", "'1.5 m' is no number"),
+        (b"(1.5, 2.5, 3.5)\n", r"'\(1.5' is no number"),
+        (b"431000 5400000 200,5\n", "commas as decimal points"),
+        (b"PK\3\4" + bytes(range(256)), r"\(it is a workbook or an archive, not text\)"),
+    ],
+)
+def test_text_that_holds_no_rows_of_points_is_called_what_it_is(tmp_path, content, said):
+    (tmp_path / "a.txt").write_bytes(content)
+    with pytest.raises(StageError, match=said):
+        read_cloud(tmp_path / "a.txt")
 
 
 def test_a_header_that_is_not_understood_is_named(tmp_path):
@@ -282,18 +318,21 @@ def test_numbers_and_names_of_points_are_no_coordinates_and_that_is_said(tmp_pat
     assert "1 of its columns have no names" in "".join(text_notes(tmp_path / "more.xyz"))
 
 
-@pytest.mark.parametrize("further", ["colours", "intensity and colours", "intensity", "none"])
+@pytest.mark.parametrize(
+    "further", ["colours", "intensity and colours", "intensity", "share", "share and colours", "none"]
+)
 def test_rows_and_columns_of_a_scanners_grid_are_no_coordinates_and_that_is_said(tmp_path, further):
     rng, places = np.random.default_rng(0), np.arange(40)
     points, colors = rng.uniform(0, 50, (40, 3)).round(3) + 5e5 + 0.0004, rng.integers(0, 256, (40, 3))
     bright = rng.integers(0, 2048, (40, 1))
-    behind = ([bright] if "intensity" in further else []) + ([colors] if "colours" in further else [])
+    behind = [bright] if "intensity" in further else [bright / 2048] if "share" in further else []
+    behind += [colors] if "colours" in further else []
     rows = np.column_stack([places // 8, places % 8, points, *behind])
     np.savetxt(tmp_path / "faro.xyz", rows, fmt="%.4f")
     found = read_cloud(tmp_path / "faro.xyz")
     np.testing.assert_allclose(found.points, points)
     assert "first two columns are rows and columns of a scan" in "".join(text_notes(tmp_path / "faro.xyz"))
-    assert further != "colours" or np.array_equal(found.colors, colors)
+    assert further not in ("colours", "share and colours") or np.array_equal(found.colors, colors)
 
 
 def test_a_grid_of_heights_with_whole_eastings_and_northings_is_no_scanners(tmp_path):
@@ -301,8 +340,8 @@ def test_a_grid_of_heights_with_whole_eastings_and_northings_is_no_scanners(tmp_
     normals = rng.normal(size=(40, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     far = np.column_stack([places // 8 + 5e5, places % 8 + 5.4e6, rng.uniform(1, 9, 40), rng.random((40, 2))])
-    near = np.column_stack([places // 8, places % 8, rng.uniform(1, 9, 40), normals])
-    for rows in (far, near):
+    near, shares = (np.column_stack([places // 8, places % 8, far[:, 2], three]) for three in (normals, abs(normals)))
+    for rows in (far, near, shares / [1, 1, 1, 1.1, 1.1, 1.1]):
         np.savetxt(tmp_path / "grid.xyz", rows, fmt="%.4f")
         np.testing.assert_allclose(read_cloud(tmp_path / "grid.xyz").points, rows[:, :3], atol=1e-4)
 
@@ -365,6 +404,7 @@ def test_text_is_read_in_parts_and_a_bad_row_is_counted_from_its_part(tmp_path, 
         ("//X Y Z R G B Scalar Nx Ny Nz\n4\n" + "1 2 3 10 20 30 0.5 0 0 1\n" * 4, True),  # CloudCompare's, with a count
         ("ID,N [m],E [m],H [m]\n" + "".join(f"P{k},2,1,3\n" for k in range(4)), False),
         ("x,y,z,red,green,blue,\n" + "1,2,3,10,20,30,\n" * 4, True),
+        ("X,Y,Z,Rf,Gf,Bf,\n" + "1,2,3,0.0392,0.0784,0.1176\n" * 4, True),
     ],
 )
 def test_text_as_programs_write_it(tmp_path, content, colored):
@@ -379,7 +419,7 @@ def test_pts_of_several_scans_is_one_cloud(tmp_path):
     assert read_cloud(tmp_path / "a.pts").points.tolist() == [[1, 2, 3], [4, 5, 6]] * 3
 
 
-@pytest.mark.parametrize("encoding", ["cp1252", "utf-16", "utf-8-sig"])
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-16", "utf-16-le", "utf-16-be", "utf-8-sig"])
 def test_text_in_other_encodings(tmp_path, encoding):
     (tmp_path / "a.csv").write_text("Punkt;Rechtswert;Hochwert;Höhe\n" + "7;1;2;3\n9;4;5;6\n" * 2, encoding=encoding)
     assert read_cloud(tmp_path / "a.csv").points.tolist() == [[1, 2, 3], [4, 5, 6]] * 2

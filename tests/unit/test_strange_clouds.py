@@ -43,6 +43,7 @@ def reds(cloud):
         ("blank_crlf.ply", HEAD.format(40) + "end_header\n\r\n" + "\r\n\r\n".join(rows())),
         ("mark.ply", "\ufeff" + HEAD.format(40) + "end_header\n\ufeff" + "\n".join(rows())),
         ("carriage.xyz", "\r".join(rows())),
+        ("dos.xyz", "\r\n".join([*rows(), "\x1a"])),
         ("quoted.csv", "x,y,z\n" + "\n".join('"' + '","'.join(map(str, row)) + '"' for row in GRID)),
         ("spaced.csv", "x , y , z\n" + "\n".join(rows(" , "))),
         ("pipes.txt", "x|y|z\n" + "\n".join(rows("|"))),

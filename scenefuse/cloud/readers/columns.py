@@ -107,10 +107,12 @@ def bytes_of(colors: NDArray[Any], white: float | None = None) -> NDArray[np.uin
 
 
 def separator(line: str) -> str | None:
-    """What separates the cells of a row; None for blanks. A tab does where no blanks separate words as well."""
+    """What separates the cells of a row; None for blanks. A tab does where no blanks separate numbers as well."""
     mark = next((mark for mark in ";,|" if mark in line), None)
-    tabs = mark is None and "\t" in line.strip() and not any(len(cell.split()) > 1 for cell in line.split("\t"))
-    return "\t" if tabs else mark
+    if mark or "\t" not in line.strip():
+        return mark
+    numbers = [sum(number(word) is not None for word in cell.split()) for cell in line.split("\t")]
+    return None if max(numbers) > 1 else "\t"
 
 
 def cells_of(line: str, mark: str | None) -> list[str]:
@@ -226,7 +228,7 @@ def _one_by_one(
     """The same, cell by cell."""
     found: list[list[float]] = []
     for at, line in enumerate(lines, where[1]):
-        text = line.decode("latin-1")
+        text = line.decode("latin-1").rstrip("\x1a")  # which ends a text of DOS
         text = COMMENT.split(text)[0] if comments else text
         if not text.strip():
             continue

@@ -28,10 +28,14 @@ from scenefuse.cloud.readers.columns import (
 from scenefuse.core.stage import StageError
 
 TEXTS = (".xyz", ".pts", ".txt", ".asc", ".csv")
-# What surveyors call the columns, in lower case.
+# What surveyors call the columns, in lower case, and what may stand beside that.
 EASTING = ("x", "easting", "east", "e", "rechtswert", "rw", "ostwert")
 NORTHING = ("y", "northing", "north", "n", "hochwert", "hw", "nordwert")
 ELEVATION = ("z", "elevation", "elev", "height", "h", "altitude", "alt", "hoehe", "höhe")
+BESIDE = {"m", "utm", "coord", "coords", "coordinate"}
+DEGREES = re.compile("lon|lat", re.IGNORECASE)
+# How the grids of Esri, GRASS and Surfer begin.
+RASTER = re.compile(r"(ncols|nrows|north:|DSAA)\s", re.IGNORECASE)
 # By how much the better of two places for the colours among the columns has to be.
 MIN_CORRELATION_GAIN = 0.1
 # Red, green and blue of a picture reach alike far; an intensity, a return and a class do not.
@@ -91,48 +95,59 @@ def text_layout(path: Path) -> TextLayout:
     rows = begin.rows(path, list(islice(_lines(path), above, TOGETHER)), above + 1, range(width))
     rows = rows[np.isfinite(rows).any(1)]
     known = np.asarray(np.isfinite(rows).any(0))
-    names = _names(head[:above], mark, width)
-    if len(names) == width:
-        usual, said = common_names(names), list[str]()
-        plain = [re.sub(r"[\s_]*(\[\w+\]|\(\w+\)|_m)$", "", name).lower() for name in names]  # N [m], E_m
-        axes = [[k for k, name in enumerate(plain) if name in own] for own in (EASTING, NORTHING, ELEVATION)]
-        if not set(POSITION) <= set(usual) and all(len(found) == 1 for found in axes):
-            for axis, (k,) in zip(POSITION, axes):
-                usual[k] = axis
-            said = [f"{path.name}: {', '.join(f'{axis} is {names[k]}' for axis, (k,) in zip(POSITION, axes))}"]
-        if set(POSITION) <= set(usual):
-            words = [name for name, numbers in zip(names, known) if name and not numbers]
-            said += [f"{path.name}: its columns without numbers are left out: {', '.join(words)}"] if words else []
-            columns = {name: k for k, name in enumerate(usual) if name in POSITION or (name and known[k])}
-            return replace(begin, columns=columns, notes=said)
-    degrees = next((name for name in names if name.lower().startswith(("lon", "lat"))), None)
-    if degrees is not None:
-        raise StageError(f"{path} is in degrees (column {degrees}); project it to metres first, to UTM for instance")
     while rows.shape[1] > 3 and not known[rows.shape[1] - 1]:  # words behind the numbers, or a separator
         rows = rows[:, :-1]
     notes, first = list[str](), 1 if named else _indices(rows)
-    if first == 1:
-        notes.append(f"{path.name}: its first column names or numbers the points and is left out")
-    elif first:
-        notes.append(f"{path.name}: its first two columns are rows and columns of a scan and are left out")
-    if len(names) - rows.shape[1] + first in (0, 1):
-        title = head[above - 1].strip()[:60]
-        notes.append(f"{path.name}: '{title}' names no columns x, y, z; the first three are these")
-    columns, guessed = _unnamed(path, rows[:, first:])
-    return replace(begin, columns={name: first + k for name, k in columns.items()}, notes=[*notes, *guessed])
+    headers = list(_headers(head[:above], mark, width, rows.shape[1] - 1 if first == 1 else 0))
+    fitting = [names for names in headers if rows.shape[1] <= len(names) <= width]
+    names = next((names for names in fitting if _axes(names)), [])
+    if axes := _axes(names):
+        usual = common_names(names)
+        if not set(POSITION) <= set(usual):
+            notes = [f"{path.name}: {', '.join(f'{axis} is {names[k]}' for axis, k in zip(POSITION, axes))}"]
+        words = [name for name, numbers in zip(names, known) if name and not numbers]
+        notes += [f"{path.name}: its columns without numbers are left out: {', '.join(words)}"] if words else []
+        own = {name: k for k, name in enumerate(usual) if k not in axes and name not in POSITION and name and known[k]}
+        columns = dict(zip(POSITION, axes)) | own
+    else:
+        _check_order(path, headers, rows.shape[1])
+        names = next(iter(fitting), headers[0] if headers else [])
+        degrees = next((name for line in fitting or [names] for name in line if DEGREES.match(name)), None)
+        if degrees is not None:
+            raise StageError(
+                f"{path} is in degrees (column {degrees}); project it to metres first, to UTM for instance"
+            )
+        if first == 1:
+            notes.append(f"{path.name}: its first column names or numbers the points and is left out")
+        elif first:
+            notes.append(f"{path.name}: its first two columns are rows and columns of a scan and are left out")
+        if len(names) - rows.shape[1] + first in (0, 1):
+            title = head[above - 1].strip()[:60]
+            notes.append(f"{path.name}: '{title}' names no columns x, y, z; the first three are these")
+        columns, guessed = _unnamed(path, rows[:, first:])
+        columns, notes = {name: first + k for name, k in columns.items()}, [*notes, *guessed]
+    empty = [k for axis, k in columns.items() if axis in POSITION and not known[k]]
+    cells = cells_of(head[above], mark)
+    if empty and (said := _no_number([cells[k] for k in empty if k < len(cells)])):
+        raise ValueError(said)
+    return replace(begin, columns=columns, notes=notes)
 
 
 def _lines(path: Path) -> Iterator[bytes]:
     """The lines of a text in UTF-8, or in one byte a letter; without a byte order mark."""
     with open(path, "rb") as file:
         begin = file.read(1 << 16)
-        wide = begin.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        if begin.startswith((b"PK\3\4", b"\xd0\xcf\x11\xe0")):
+            raise ValueError("it is a workbook or an archive, not text")
+        halves = {name: begin[k::2] for k, name in enumerate(("utf-16-be", "utf-16-le"))}
+        wide = next((name for name, half in halves.items() if 2 * half.count(0) > len(half)), "")
+        wide = "utf-16" if begin.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else wide
         if not wide and (b"\n" in begin or b"\r" not in begin):
             file.seek(len(codecs.BOM_UTF8) if begin.startswith(codecs.BOM_UTF8) else 0)
             yield from file
             return
     # Spreadsheets write UTF-16, and old Macs end lines by a carriage return alone.
-    with open(path, encoding="utf-16" if wide else "latin-1", errors="replace") as text:
+    with open(path, encoding=wide or "latin-1", errors="replace") as text:
         yield from (line.encode(errors="replace") for line in text)
 
 
@@ -163,10 +178,48 @@ def read_text(path: Path, at_once: int = AT_ONCE) -> Iterator[Columns]:
         first += len(some)
 
 
-def _names(above: list[str], mark: str | None, columns: int) -> list[str]:
-    """The names in the nearest line above the rows that has one for each column; else those in the last line."""
-    lines = [cells_of(line.strip(" \r\n/#"), mark) for line in reversed(above)]
-    return next((names for names in lines if len(names) == columns), lines[0] if lines else [])
+def _headers(above: list[str], mark: str | None, width: int, unnumbered: int) -> Iterator[list[str]]:
+    """The names that lines above the rows may hold, the nearest first, each split as the rows are, and in its own way.
+
+    Empty ones at its end do not count, nor do those of cells that all rows leave out. Where there are so many as
+    `unnumbered`, the first column, which numbers the points, has none.
+    """
+    for line in reversed(above):
+        line = line.strip(" \r\n/#%")
+        for own in dict.fromkeys((mark, separator(line))):
+            names = cells_of(line if own else re.sub(r"\s+[\[(][^\])]*[\])]", "", line), own)
+            while names and not names[-1]:
+                names.pop()
+            names = names[:width] if own and own == mark and _axes(names[:width]) else names
+            yield ["", *names] if len(names) == unnumbered else names
+
+
+def _axes(names: list[str]) -> list[int]:
+    """Which columns are x, y and z by the names of programs or of surveyors; none if these do not say so."""
+    usual = common_names(names)
+    if set(POSITION) <= set(usual):
+        return [usual.index(axis) for axis in POSITION]
+    words = [re.split(r"[\s_.-]+", re.sub(r"[\[(].*", "", name.lower())) for name in names]
+    plain = ["".join(word for word in some if word not in BESIDE) for some in words]
+    found = [[k for k, name in enumerate(plain) if name in own] for own in (EASTING, NORTHING, ELEVATION)]
+    return [k for (k,) in found] if all(len(some) == 1 for some in found) else []
+
+
+def _check_order(path: Path, headers: list[list[str]], columns: int) -> None:
+    """StageError where a line names x, y and z in another order, but not so many columns as there are."""
+    for names in headers:
+        axes = _axes(names)
+        if axes and (axes[1] - axes[0], axes[2] - axes[1]) != (1, 1):
+            raise StageError(
+                f"{path}: '{' '.join(names)[:60]}' names {len(names)} columns, but the rows have {columns}; give each"
+                " column one name, without blanks"
+            )
+
+
+def _no_number(cells: list[str]) -> str:
+    """What is wrong with the first cell that has digits, but is no number; empty where there is none."""
+    cell = next((cell for cell in cells if number(cell) is None and re.search(r"\d", cell)), "")
+    return f"{cell[:30]!r} is no number: write it without units, brackets and marks between thousands" if cell else ""
 
 
 def _unnamed(path: Path, rows: NDArray[np.float64]) -> tuple[dict[str, int], list[str]]:
@@ -250,11 +303,16 @@ def _first_row(path: Path, head: list[str]) -> tuple[int, str | None, int, bool]
 
     Raises:
         ValueError: there are none.
-        StageError: decimals have commas.
+        StageError: decimals have commas; the file is a raster, or PTX.
     """
+    if RASTER.match("".join(head).lstrip()):
+        raise StageError(f"{path} is a raster of heights, not rows of points; export its cells as x y z")
+    if [len(line.split()) for line in head[:10]] == [1, 1, 3, 3, 3, 3, 4, 4, 4, 4]:
+        raise StageError(f"{path} is PTX, whose scans have poses of their own; convert it to E57 or LAS")
     last = next(line.strip() for line in reversed(head) if line.strip())
     commas = len(re.findall(r"(?<![\d.,])-?\d+,\d+(?![\d.,])", last))
-    if commas >= 3 or (commas and (";" in last or "\t" in last)):
+    blanks = [number(cell) for cell in last.replace(",", ".").split()]
+    if commas >= 3 or (commas and (";" in last or "\t" in last or (len(blanks) > 2 and None not in blanks[:3]))):
         raise StageError(f"{path} has commas as decimal points: '{last[:60]}'; export it with points")
     kinds: list[tuple[str | None, int, tuple[int, ...]] | None] = []
     for line in head:
@@ -266,7 +324,8 @@ def _first_row(path: Path, head: list[str]) -> tuple[int, str | None, int, bool]
         kinds.append((mark, len(cells), words) if some else None)
     found = [kind for kind in kinds if kind is not None]
     if not found:
-        raise ValueError("none of its first lines holds three numbers")
+        said = _no_number(cells_of(last, separator(last)))
+        raise ValueError("none of its first lines holds three numbers" + (f", {said}" if said else ""))
     usual = next((kind for kind in found if not kind[2]), max(found, key=found.count))
     # Words in some rows alone may stand in the first ones.
     rows = {usual, *(kind for kind in found if kind[:2] == usual[:2] and found.count(kind) > 1)}
@@ -280,8 +339,12 @@ def _indices(rows: NDArray[np.float64]) -> int:
     first, columns = rows[:, 0], rows.shape[1]
     if columns <= 3 or len(rows) <= 3:
         return 0
-    whole = (rows == np.rint(rows)).all(0)
-    if columns > 4 and whole[:2].all() and not whole[2:5].any() and (columns % 3 == 2 or whole[5:].all()):
+    whole = np.asarray((rows == np.rint(rows)).all(0))
+    shares = np.asarray(((rows >= 0) & (rows <= 1)).all(0))  # as colours may be, and an intensity
+    unit = np.abs(np.linalg.norm(rows[:, 3:6], axis=1) - 1) < UNIT_TOLERANCE
+    bright = whole[5:6].all() or (shares[5] and not shares[3:5].all() and not unit.all())
+    grid = columns > 4 and whole[:2].all() and not whole[2:5].any()
+    if grid and (columns % 3 == 2 or (bright and whole[6:].all())):
         return 2 if rows[:, :2].min() >= 0 and rows[:, :2].max() <= MAX_GRID_ROWS else 0
     if (first == first[0] + np.arange(len(first))).all():
         return 1
