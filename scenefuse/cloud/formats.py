@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import AT_ONCE, POSITION, Columns, common_names
+from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, POSITION, Columns, common_names
 from scenefuse.cloud.readers.e57 import read_e57
 from scenefuse.cloud.readers.las import check_projected, las_crs, read_las
 from scenefuse.cloud.readers.meshes import read_glb, read_obj
@@ -105,8 +105,15 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def _checked(path: Path, columns: Columns) -> Columns:
-    """Columns by their common names; StageError where there are no positions."""
+    """Columns by their common names, the colours of Gaussian splats among them; StageError without positions."""
     columns = dict(zip(common_names(list(columns)), columns.values()))
+    if {"f_dc_0", "f_dc_1", "f_dc_2"} <= set(columns) and not set(COLOR) & set(
+        columns
+    ):  # spherical harmonics, degree 0
+        shares = [0.5 + columns[f"f_dc_{k}"] / np.sqrt(4 * np.pi) for k in range(3)]
+        columns |= {
+            name: np.rint(255 * np.nan_to_num(share).clip(0, 1)).astype(np.uint8) for name, share in zip(COLOR, shares)
+        }
     if not set(POSITION) <= set(columns):
         raise StageError(f"{path} has no columns x, y and z but {', '.join(columns) or 'none'}; export it again")
     return columns

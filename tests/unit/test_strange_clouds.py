@@ -70,6 +70,13 @@ def reds(cloud):
             "pcd.pcd",
             "# Gerät\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nWIDTH 40\nHEIGHT 1\nDATA ascii\n" + "\n\n".join(rows()),
         ),
+        ("old.pcd", "COLUMNS x y z\nSIZE 8 8 8\nTYPE F F F\nPOINTS 40\nDATA ASCII\n" + "\n".join(rows())),
+        (
+            "views.ply",
+            HEAD.format(40).replace("property", "property list uchar uint before\nproperty", 1)
+            + "property list uchar uint view_indices\nend_header\n"
+            + "\n".join(f"2 7 8 {line} {k % 3}" + " 9" * (k % 3) for k, line in enumerate(rows())),
+        ),
     ],
     ids=lambda text: text[:20] if text.isprintable() else "",
 )
@@ -97,6 +104,12 @@ def test_rows_whose_number_is_missing_are_left_out_and_counted(tmp_path, missing
         ("a.xyz", "\n".join(["1 2 3 4", *rows()]), "line 2, has 3 columns, the first row 4: .*; correct that line, or"),
         ("a.ply", HEAD.format(41) + "end_header\n" + "\n".join(rows()), "cut short: its last 1 points are missing"),
         ("a.ply", HEAD.format(10**12) + "end_header\n" + "\n".join(rows()), "its last 999999999960 points are missing"),
+        (
+            "a.ply",
+            HEAD.format(40) + "property uint64 t\nend_header\n" + "\n".join(rows()),
+            r"\(its property t is of type uint64, which PLY does not have: leave it out\)",
+        ),
+        ("a.pcd", "SIZE 4 4 4\nTYPE F F F\nWIDTH 9\nHEIGHT 1\nDATA binary\n", "does not say what its rows hold"),
         ("a.ply", HEAD.format(-1) + "end_header\n", "its header counts less than no rows"),
         (
             "a.ply",
@@ -146,6 +159,13 @@ def test_of_a_damaged_cloud_that_the_workflow_made_it_is_said_that_it_will_be_ma
 def test_colours_are_found_by_their_names(tmp_path, names):
     (tmp_path / "a.csv").write_text(f"X[m],Y[m],Z[m],{names}\n" + "\n".join(rows(",", *zip(*COLORS))), "utf-8")
     assert read_cloud(tmp_path / "a.csv").colors.tolist() == COLORS
+
+
+def test_gaussian_splats_have_the_colours_of_their_first_harmonic(tmp_path):
+    harmonics = ((np.array(COLORS) / 255 - 0.5) / 0.28209479177387814).T
+    names = "".join(f"property float f_dc_{k}\n" for k in range(3))
+    (tmp_path / "a.ply").write_text(HEAD.format(40) + names + "end_header\n" + "\n".join(rows(" ", *harmonics)))
+    assert read_cloud(tmp_path / "a.ply").colors.tolist() == COLORS
 
 
 def test_one_name_of_a_colour_alone_is_none(tmp_path):

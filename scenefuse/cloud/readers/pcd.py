@@ -1,4 +1,4 @@
-"""PCD 0.7, the format of PCL: ASCII, binary and compressed.
+"""PCD 0.5 to 0.7, the format of PCL: ASCII, binary and compressed.
 
 Open3D misreads positions that are binary doubles, without a word.
 """
@@ -65,21 +65,22 @@ def _header(path: Path) -> _Header:
             line = file.readline()
             lines += 1
             cells = line.decode("latin-1").split()
-            words |= {cells[0]: cells[1:]} if cells else {}
+            words |= {cells[0].upper(): cells[1:]} if cells else {}
             if not line:
                 raise ValueError("it has no PCD header")
         begin = file.tell()
-    names = words["FIELDS"]
+    names = words.get("FIELDS", words.get("COLUMNS", []))  # as version 0.5 calls them
     repeats = [int(n) for n in words.get("COUNT", ["1"] * len(names))]
-    types = [np.dtype(f"<{kind.lower()}{size}") for kind, size in zip(words["TYPE"], words["SIZE"])]
-    count = int(words["WIDTH"][0]) * int(words["HEIGHT"][0])
+    types = [np.dtype(f"<{kind.lower()}{size}") for kind, size in zip(words.get("TYPE", []), words.get("SIZE", []))]
+    width, height = words.get("WIDTH", words.get("POINTS", ["0"])), words.get("HEIGHT", ["1"])
+    count, data = int(width[0]) * int(height[0]), words["DATA"][0].lower()
     size = sum(kind.itemsize * n for kind, n in zip(types, repeats))
     if len({len(names), len(repeats), len(types)}) > 1 or count < 0 or size <= 0 or min(repeats) < 0:
         raise ValueError("its header does not say what its rows hold")
     missing = count - (path.stat().st_size - begin) // size
-    if words["DATA"][0] == "binary" and missing > 0:
+    if data == "binary" and missing > 0:
         raise StageError(f"{path} is cut short: its last {missing} points are missing; copy it again")
-    return _Header(names, types, repeats, count, words["DATA"][0], begin, lines)
+    return _Header(names, types, repeats, count, data, begin, lines)
 
 
 def _lines(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:

@@ -44,13 +44,13 @@ class Element:
         name: vertex, face, ...
         count: of rows.
         row: their NumPy type; None where they hold lists, so that rows differ in length.
-        lists: whether a property is a list, by its name.
+        kinds: what the file calls the types of its properties, by their names.
     """
 
     name: str
     count: int
     row: np.dtype[Any] | None
-    lists: dict[str, bool] = field(default_factory=dict)
+    kinds: dict[str, str] = field(default_factory=dict)
 
 
 def read_header(path: Path) -> tuple[list[Element], int] | None:
@@ -112,7 +112,7 @@ def check_size(path: Path, elements: list[Element], offset: int, advice: str = "
     """StageError where a binary file is too small for what its header counts; a list takes a byte at least."""
     there = path.stat().st_size - offset
     for element in elements:
-        size = len(element.lists) if element.row is None else element.row.itemsize
+        size = len(element.kinds) if element.row is None else element.row.itemsize
         there -= size * element.count
         if there < 0:
             raise _cut_short(path, element.name, min(-(there // size), element.count), advice)
@@ -153,19 +153,29 @@ def _mesh_of_text(path: Path, elements: list[Element], offset: int) -> tuple[Col
             rows = list(islice((line for line in file if line.strip()), element.count))
             if len(rows) < element.count:
                 raise _cut_short(path, element.name, element.count - len(rows))
-            faces += [_corners(element, row) for row in rows] if element.name == "face" else []
+            if element.name == "face":
+                corners = (next((cells for name, cells in _cells(element, row) if name in CORNERS), []) for row in rows)
+                faces += [[int(float(cell)) for cell in cells] for cells in corners]
+            elif element.name == "vertex":
+                vertex = _beside_lists(element, rows)
     return vertex, faces
 
 
-def _corners(element: Element, row: bytes) -> list[int]:
-    """The corners of a face in a row of text; none where it has other lists alone."""
+def _cells(element: Element, row: bytes) -> Iterator[tuple[str, list[bytes]]]:
+    """The properties of a row of text that holds lists, and the cells of each."""
     cells, at = row.split(), 0
-    for name, is_list in element.lists.items():
-        count = int(float(cells[at])) if is_list else 1
-        if name in CORNERS:
-            return [int(float(cell)) for cell in cells[at + 1 : at + 1 + count]]
-        at += count + is_list
-    return []
+    for name, kind in element.kinds.items():
+        is_list = kind == "list"
+        end = at + (1 + int(float(cells[at])) if is_list else 1)
+        yield name, cells[at + is_list : end]
+        at = end
+
+
+def _beside_lists(element: Element, rows: list[bytes]) -> Columns:
+    """The columns of rows of text that hold lists as well; these are left out."""
+    kinds = {name: np.dtype(TYPES[kind]) for name, kind in element.kinds.items() if kind != "list"}
+    table = [[float(cells[0]) for name, cells in _cells(element, row) if name in kinds] for row in rows]
+    return {name: typed(np.array(values), kinds[name]) for name, values in zip(kinds, zip(*table))}
 
 
 def _rows(path: Path, element: Element, offset: int, is_text: bool, at_once: int) -> Iterator[Columns]:
@@ -238,6 +248,9 @@ def _elements(lines: list[str], order: str) -> list[Element]:
             columns[name] = words[1]
     if any(count < 0 for _, count, _ in found):
         raise ValueError("its header counts less than no rows")
+    own = {name: kind for element, _, kinds in found if element == "vertex" for name, kind in kinds.items()}
+    if unknown := next((name for name, kind in own.items() if kind not in {*TYPES, "list"}), ""):
+        raise ValueError(f"its property {unknown} is of type {own[unknown]}, which PLY does not have: leave it out")
     return [
         Element(
             name,
@@ -245,7 +258,7 @@ def _elements(lines: list[str], order: str) -> list[Element]:
             np.dtype([(own, order + TYPES[kind]) for own, kind in kinds.items()])
             if {*kinds.values()} <= {*TYPES}
             else None,
-            {own: kind not in TYPES for own, kind in kinds.items()},
+            kinds,
         )
         for name, count, kinds in found
     ]
