@@ -41,9 +41,11 @@ def missing_links(page: Path) -> list[str]:
 
 
 def missing_paths(text: str) -> list[str]:
-    """Paths in backticks that begin with a folder of the repository and do not exist; a name in capitals is a blank."""
-    quoted = re.findall(rf"`((?:{'|'.join(PARTS)})/[\w./-]*)`", text)
-    return [path for path in quoted if not (ROOT / path).exists() and not re.search(r"/[A-Z]+(/|\.py$)", path)]
+    """Paths in backticks, a folder of the repository or a module, that do not exist; a name in capitals is a blank."""
+    quoted = re.findall(rf"`((?:{'|'.join(PARTS)})/[\w./-]*|\w+\.py)`", text)
+    modules = {path.name for part in PARTS for path in (ROOT / part).rglob("*.py")}
+    missing = [path for path in quoted if path not in modules and not (ROOT / path).exists()]
+    return [path for path in missing if not re.search(r"/[A-Z]+(/|\.py$)", path)]
 
 
 def missing_scripts(text: str) -> list[str]:
