@@ -60,9 +60,27 @@ def camera_files(given: Path) -> list[Path]:
     if given.is_file():
         listed, coords = bundler_list(given), given.parent.parent / COORDS
         return [given, *([listed] if listed else []), *([coords] if coords.is_file() else [])]
+    exported = [file for export in exports_in(given) for file in camera_files(export)]
     models = [model / name for model in colmap_models(given) for name in MODEL_FILES]
     places = [given / name for name in [*CAMERA_FILES, COORDS]]
-    return [file for file in [*models, *places] if file.is_file()] or [given]
+    return [file for file in [*models, *places] if file.is_file()] or exported or [given]
+
+
+def exports_in(folder: Path) -> list[Path]:
+    """Metashape's XML and Bundler's files in a folder."""
+    begin = {".xml": b"<chunk", BUNDLER: b"# Bundle"}
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    marks = [(file, begin.get(file.suffix.lower())) for file in files if file.is_file()]
+    return [file for file, mark in marks if mark and mark in beginning(file)]
+
+
+def beginning(file: Path) -> bytes:
+    """Enough of a file to know its format; nothing of one that cannot be read."""
+    try:
+        with open(file, "rb") as stream:
+            return stream.read(4096)
+    except OSError:
+        return b""
 
 
 def colmap_models(given: Path) -> list[Path]:

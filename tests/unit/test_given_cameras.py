@@ -18,6 +18,7 @@ from scenefuse.core.stage import StageError, quantity, read_json, value
 from scenefuse.georef.georeference import camera_poses
 from scenefuse.photos.cameras.given import PosedPhoto, stood_upright
 from scenefuse.photos.cameras.read_cameras import place_of, read_posed_photos
+from scenefuse.photos.photo_files import camera_files
 from scenefuse.photos.photos import write_photos
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm.mapping import MappingSettings, map_photos
@@ -248,9 +249,6 @@ def test_wrong_cameras_are_named(tmp_path):
     with_database(tmp_path)
     with pytest.raises(StageError, match="do not exist"):
         mapped(tmp_path, tmp_path / "none")
-    (tmp_path / "project.psx").touch()
-    with pytest.raises(StageError, match=r"project\.psx is not read; in Metashape, export the cameras as Agisoft XML"):
-        read_posed_photos(tmp_path / "project.psx", tmp_path / "photos")
     path = nerfstudio(tmp_path)
     content = json.loads(path.read_text())
     for frame, other in zip(content["frames"], json.loads(path.read_text())["frames"][::-1]):
@@ -264,6 +262,57 @@ def test_wrong_cameras_are_named(tmp_path):
     (tmp_path / "opensfm/reconstruction.json").write_text("{}")
     with pytest.raises(StageError, match="holds no cameras of OpenSfM that can be read"):
         read_posed_photos(tmp_path / "opensfm/reconstruction.json", tmp_path / "photos")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("project.psx", "", "it is Metashape's project; in Metashape, export the cameras as Agisoft XML"),
+        (
+            "block.xml",
+            "<?xml?>\n<BlocksExchange version='2.1'>",
+            "ContextCapture's .*; import it in Metashape",
+        ),
+        ("model.nvm", "NVM_V3\n", "VisualSFM's NVM; export the reconstruction as Bundler's"),
+        ("a_calibrated_camera_parameters.txt", "fileName imageWidth", "Pix4D's; export OPF"),
+        ("sfm.json", '{"version": ["1"], "featuresFolders": []}', "Meshroom's; convert it to COLMAP"),
+        ("sfm_data.json", '{"sfm_data_version": "0.3"}', "OpenMVG's; convert it to COLMAP"),
+        ("cameras.json", '[{"id": 0, "img_name": "a"}]', "of a Gaussian splatting; give the model of COLMAP"),
+        ("images.txt", "# Image list", "part of COLMAP's project; give the folder"),
+        ("database.db", "SQLite format 3\0", "part of COLMAP's project; give the folder"),
+        (
+            "cameras.json",
+            '{"v2 dji": {"projection_type": "brown"}}',
+            r"no cameras in a known format; give sparse/ .*\.out",
+        ),
+        ("cameras.kml", "<kml/>", r"no cameras in a known format; give sparse/ .*Bundler's \.out with list\.txt"),
+    ],
+)
+def test_cameras_in_no_format_that_is_read_are_named_with_what_is_read(tmp_path, name, text, sentence):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(StageError, match=f"{name} .*{sentence}"):
+        read_posed_photos(tmp_path / name, tmp_path)
+
+
+@pytest.mark.parametrize("upper", [False, True])
+@pytest.mark.parametrize("write", [metashape, bundler])
+def test_a_folder_may_hold_the_cameras_of_metashape_or_bundler(tmp_path, write, upper):
+    (tmp_path / "photos").mkdir()
+    for view in FLIGHT.views:
+        (tmp_path / "photos" / view.name).touch()
+    write(tmp_path)
+    (tmp_path / "doc").mkdir()
+    (tmp_path / "nohup.out").write_text("done\n")
+    (tmp_path / "log.xml").write_text("<log/>")
+    files = [file for name in ("cameras.xml", "bundle.out", "list.txt") if (file := tmp_path / name).is_file()]
+    if upper:
+        files = [file.rename(file.with_name(file.name.upper())) for file in files]
+    assert camera_files(tmp_path) == files
+    found, program, _ = read_posed_photos(tmp_path, tmp_path / "photos")
+    assert len(found) == 9 and program.casefold() == write.__name__
+    (tmp_path / "other.XML").write_text("<document><chunk/></document>")
+    with pytest.raises(StageError, match=r"holds cameras in .* and in .*; give one of these files"):
+        read_posed_photos(tmp_path, tmp_path / "photos")
 
 
 def test_where_cameras_were_given_the_advice_is_about_these(tmp_path):

@@ -285,7 +285,7 @@ def shrink(file, size):
         (lambda root: (root / "transforms.json").write_text("[]"), "no list of frames"),
         (lambda root: (root / "images/02.png").write_text("no picture"), "images/02.png cannot be decoded"),
         (lambda root: (root / "masks/02.png").unlink(), r"frame 2 .*its mask masks/02.png does not exist"),
-        (lambda root: (root / "masks/02.png").write_text("no picture"), "masks/02.png cannot be decoded"),
+        (lambda root: (root / "masks/02.png").write_text("no picture"), "masks/02.png cannot be read; export it again"),
         (edit(camera_model="OPENCV_FISHEYE"), "camera model OPENCV_FISHEYE is not read; undistort"),
         (edit(frame_camera_model="EQUIRECTANGULAR"), r"frame 0 .*EQUIRECTANGULAR is not read"),
         (edit(k4=0.1), "distortion with k4 is not read"),
@@ -297,7 +297,7 @@ def shrink(file, size):
         (edit(frame_transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()), "is no rotation"),
         (edit(frame_file_path="images/01.png"), "two photos .* are both called 01"),
         (shrink("images/02.png", (64, 64)), "02.png has 64 x 64 pixels, but its camera 96 x 64"),
-        (shrink("masks/02.png", (64, 64)), "the mask .*02.png has 64 x 64 pixels, but its photo 96 x 64"),
+        (shrink("masks/02.png", (64, 64)), "the mask .*02.png is 64 x 64 pixels, its photo 96 x 64"),
         (edit(frames=[]), "no list of frames"),
     ],
 )

@@ -20,17 +20,36 @@ from scenefuse.core.transforms import Array
 from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, PosedPhoto, colmap_camera, largest
 from scenefuse.photos.cameras.json_cameras import TRANSFORMS, find_opensfm, opensfm_place, read_opensfm, read_transforms
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
-from scenefuse.photos.photo_files import BUNDLER, bundler_list, colmap_models, files_by_name, stored_size
+from scenefuse.photos.photo_files import (
+    BUNDLER,
+    CAMERA_FILES,
+    beginning,
+    bundler_list,
+    colmap_models,
+    exports_in,
+    files_by_name,
+    stored_size,
+)
 
 Found = TypeVar("Found")
 LAYOUTS = (
-    "sparse/ or sparse/0 (COLMAP), transforms.json (nerfstudio), transforms_train.json (Blender) or"
-    " reconstruction.json (OpenSfM); or Metashape's XML or Bundler's .out"
+    "sparse/ or sparse/0 (COLMAP), transforms.json (nerfstudio), transforms_train.json (Blender), reconstruction.json"
+    " (OpenSfM), Metashape's XML, or Bundler's .out with list.txt"
 )
 METASHAPE = "in Metashape, export the cameras as Agisoft XML (File, Export, Export Cameras)"
 REALITY = "in RealityCapture, export the registration as Bundler v0.3 (.out) with the list of photos"
-# What to do about files of other programs that hold cameras in a form that is not read.
-EXPORTS = {".psx": METASHAPE, ".psz": METASHAPE, ".csv": REALITY, ".rcproj": REALITY}
+# Names, or beginnings, of files that hold cameras in a form that is not read; whose they are, and what to do.
+UNREAD = {
+    r"\.ps[xz]$": ("Metashape's project", METASHAPE),
+    r"\.(csv|rcproj|xmp)$": ("RealityCapture's", REALITY),
+    r"<BlocksExchange": ("ContextCapture's BlocksExchange", f"import it {METASHAPE}"),
+    r"\.nvm$|^NVM_V3": ("VisualSFM's NVM", "export the reconstruction as Bundler's .out with list.txt"),
+    r"\.(p4d|opf)$|calibrated_(external_)?camera": ("Pix4D's", "export OPF, and convert it by opf2nerf of pyopf"),
+    r"\.(sfm|mg|abc)$|\"featuresFolders\"": ("Meshroom's", "convert it to COLMAP by aliceVision_exportColmap"),
+    r"\"sfm_data_version\"": ("OpenMVG's", "convert it to COLMAP by openMVG_main_openMVG2Colmap"),
+    r"\"img_name\"": ("of a Gaussian splatting", "give the model of COLMAP that it was trained on"),
+    r"^(cameras|images|points3D)\.(txt|bin)$|^SQLite": ("a part of COLMAP's project", "give the folder of the model"),
+}
 # What may follow a photo's name in the list: a zero, and its focal length by EXIF.
 FOCAL = re.compile(r"\s+0\s+[-+.\deE]+$")
 # What reading a damaged file ends with.
@@ -92,13 +111,8 @@ def _format_of(cameras: Path) -> tuple[Path, str]:
     """The file, or folder of a COLMAP model, that holds cameras, and the program whose format it has."""
     if not cameras.exists():
         raise StageError(f"the cameras {cameras} do not exist; correct the path")
-    ending = cameras.suffix.lower()
-    if ending in EXPORTS:
-        raise StageError(f"{cameras} is not read; {EXPORTS[ending]}")
     if cameras.is_file():
-        of_ending = {".xml": "Metashape", BUNDLER: "Bundler"}
-        program = "OpenSfM" if cameras.name.startswith("reconstruction") else TRANSFORMS.get(cameras.name, "nerfstudio")
-        return cameras, of_ending.get(ending, program)
+        return cameras, _program_of(cameras)
     if (file := find_opensfm(cameras)) is not None:
         return file, "OpenSfM"
     for name, program in TRANSFORMS.items():
@@ -106,7 +120,28 @@ def _format_of(cameras: Path) -> tuple[Path, str]:
             return cameras / name, program
     if colmap_models(cameras):
         return cameras, "COLMAP"
-    raise StageError(f"{cameras} holds no cameras in a known format; give a folder with {LAYOUTS}")
+    exports = exports_in(cameras)
+    if len(exports) > 1:
+        first, second = (file.name for file in exports[:2])
+        raise StageError(f"{cameras} holds cameras in {first} and in {second}; give one of these files")
+    if exports:
+        return exports[0], _program_of(exports[0])
+    raise StageError(f"{cameras} holds no cameras in a known format; give {LAYOUTS}, or a folder with one")
+
+
+def _program_of(file: Path) -> str:
+    """The program whose format a file has; StageError where that is not read."""
+    begin, ending = beginning(file), file.suffix.lower()
+    for pattern, (whose, advice) in UNREAD.items():
+        if any(re.search(pattern, text, re.IGNORECASE) for text in (file.name, begin.decode("latin-1"))):
+            raise StageError(f"{file} is not read, for it is {whose}; {advice}")
+    if ending in (".xml", BUNDLER):
+        return "Bundler" if ending == BUNDLER else "Metashape"
+    if file.name.startswith("reconstruction"):
+        return "OpenSfM"
+    if ending != ".json" or (file.name not in CAMERA_FILES and '"frames"' not in read_text(file)):
+        raise StageError(f"{file} holds no cameras in a known format; give {LAYOUTS}, or a folder with one")
+    return TRANSFORMS.get(file.name, "nerfstudio")
 
 
 def _read(file: Path, program: str) -> tuple[list[GivenCamera], list[str]]:
