@@ -243,7 +243,7 @@ def inspect_photo(folder: Path, name: str) -> Photo:
         equivalent_mm, focal_mm = (
             max(exif_number(taken.get(tag)) or 0.0, 0.0) for tag in (Base.FocalLengthIn35mmFilm, Base.FocalLength)
         )
-        if image.mode == "F":
+        if image.mode in ("F", "I"):
             raise ValueError("its pixels are 32-bit measurements, as a thermal camera's, and no picture")
         sample = _pixels(image, folder / name)[::4, ::4]
         brightest = int(np.quantile(sample, 1 - HOT_SHARE, method="lower"))
