@@ -81,7 +81,7 @@ def _split(lines: Iterable[str], path: Path) -> Iterator[list[str]]:
         broken = next((cell for cell in row if re.search("[\t\n]", cell)), None)
         if broken is not None:
             begin = re.split("[\t\n]", broken)[0]
-            raise StageError(f'{path}: no quote ends the cell that begins with "{begin}; remove the quote before it')
+            raise StageError(f"{path}: the quote before {begin} makes one cell of several lines or columns; remove it")
         yield row
 
 

@@ -48,7 +48,7 @@ BUNDLER = ".out"
 # Where in an OpenDroneMap project its place on the earth is.
 COORDS = "odm_georeferencing/coords.txt"
 # What the name of a mask may have more than its photo's: a_mask, a.jpg.mask, a-mask, mask_a.
-MASK = re.compile(r"(.+)[_.-]mask|mask[_.-](.+)", re.DOTALL)
+MASK = re.compile(r"(.+?)(?:[_.-]mask)+|mask[_.-](.+)", re.DOTALL)
 # What to do about names that do not tell photos apart.
 RENAME = "give the folder that holds the photos alone, or every photo a name of its own"
 
@@ -152,7 +152,7 @@ def masks_by_name(photos: Iterable[str], folder: Path) -> dict[str, Path]:
     """The masks below a folder by the names of their photos: for each photo the one that is named as a mask, else the
     one named like the photo; where the folder has both kinds, a file of a photo's whole name is this photo itself."""
     files, photos = pictures_below(folder), list(photos)
-    marked = [name for name, path in files.items() if MASK.fullmatch(path.stem.casefold())]
+    marked = [name for name, path in files.items() if MASK.fullmatch(_stem(path.name.casefold(), None))]
     found = photos_by_name(photos, marked, str(folder), MASK)
     whole = {key for photo in photos if found for key in _keys(photo)[1:2]}
     plain = [name for name in files if name not in found.values() and whole.isdisjoint(_keys(name))]

@@ -271,13 +271,13 @@ def test_wrong_cameras_are_named(tmp_path):
         (
             "block.xml",
             "<?xml?>\n<BlocksExchange version='2.1'>",
-            "ContextCapture's .*; import it in Metashape",
+            "ContextCapture's .*; import it into Metashape",
         ),
         ("model.nvm", "NVM_V3\n", "VisualSFM's NVM; export the reconstruction as Bundler's"),
         ("a_calibrated_camera_parameters.txt", "fileName imageWidth", "Pix4D's; export OPF"),
         ("sfm.json", '{"version": ["1"], "featuresFolders": []}', "Meshroom's; convert it to COLMAP"),
         ("sfm_data.json", '{"sfm_data_version": "0.3"}', "OpenMVG's; convert it to COLMAP"),
-        ("cameras.json", '[{"id": 0, "img_name": "a"}]', "of a Gaussian splatting; give the model of COLMAP"),
+        ("cameras.json", '[{"id": 0, "img_name": "a"}]', "a list of Gaussian splatting; give the model of COLMAP"),
         ("images.txt", "# Image list", "part of COLMAP's project; give the folder"),
         ("database.db", "SQLite format 3\0", "part of COLMAP's project; give the folder"),
         (

@@ -75,6 +75,8 @@ def test_a_photo_that_is_gone_is_not_taken_from_another_folder():
         "b.mask.png",
         "b-mask.JPG",
         "Mask_b.png",
+        "b_mask.JPG.png",
+        "b_mask_mask.png",
         "x/b.jpe",
     ],
 )

@@ -53,11 +53,12 @@ def test_sizes_hashes_positions_and_subfolders(tmp_path):
     assert value(read_json(tmp_path / "photos.json"), "with_gps") == 1
 
 
-def test_all_bad_photos_are_named_at_once(tmp_path):
+@pytest.mark.parametrize("kind", [np.float32, np.int32])
+def test_all_bad_photos_are_named_at_once(tmp_path, kind):
     save(tmp_path / "p" / "a.jpg")
     for name in ("b.jpg", "c.jpg"):
         (tmp_path / "p" / name).write_text(f"<html>{name}")
-    Image.fromarray(np.ones((9, 9), np.float32)).save(tmp_path / "p" / "d.tif")
+    Image.fromarray(np.ones((9, 9), kind)).save(tmp_path / "p" / "d.tif")
     with pytest.raises(StageError, match=r"b.jpg cannot be decoded \(it is no picture\).*; nor can c.jpg, d.tif$"):
         listed(tmp_path, tmp_path / "p")
     for name in ("b.jpg", "c.jpg"):

@@ -42,12 +42,12 @@ REALITY = "in RealityCapture, export the registration as Bundler v0.3 (.out) wit
 UNREAD = {
     r"\.ps[xz]$": ("Metashape's project", METASHAPE),
     r"\.(csv|rcproj|xmp)$": ("RealityCapture's", REALITY),
-    r"<BlocksExchange": ("ContextCapture's BlocksExchange", f"import it {METASHAPE}"),
+    r"<BlocksExchange": ("ContextCapture's BlocksExchange", "import it into Metashape, and export Agisoft XML"),
     r"\.nvm$|^NVM_V3": ("VisualSFM's NVM", "export the reconstruction as Bundler's .out with list.txt"),
     r"\.(p4d|opf)$|calibrated_(external_)?camera": ("Pix4D's", "export OPF, and convert it by opf2nerf of pyopf"),
     r"\.(sfm|mg|abc)$|\"featuresFolders\"": ("Meshroom's", "convert it to COLMAP by aliceVision_exportColmap"),
     r"\"sfm_data_version\"": ("OpenMVG's", "convert it to COLMAP by openMVG_main_openMVG2Colmap"),
-    r"\"img_name\"": ("of a Gaussian splatting", "give the model of COLMAP that it was trained on"),
+    r"\"img_name\"": ("a list of Gaussian splatting", "give the model of COLMAP that it was trained on"),
     r"^(cameras|images|points3D)\.(txt|bin)$|^SQLite": ("a part of COLMAP's project", "give the folder of the model"),
 }
 # What may follow a photo's name in the list: a zero, and its focal length by EXIF.
