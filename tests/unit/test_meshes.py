@@ -123,6 +123,19 @@ def test_an_obj_counts_vertices_from_the_end_where_it_says_so(tmp_path):
     assert np.allclose(cloud.normals, [0, 0, 1]) and cloud.points.sum(1).max() <= 1 and cloud.colors is None
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("first", [1, -1])
+def test_a_concave_face_leaves_its_notch_empty(tmp_path, axis, first):
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0.5, 0.2], [0, 1]])[::first]
+    in_space = np.roll(np.column_stack([corners, np.zeros(5)]), axis, axis=1)
+    lines = [f"v {x} {y} {z}" for x, y, z in in_space] + ["f 1 2 3 4 5"]
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    read = read_cloud(tmp_path / "a.obj")
+    u, v, _ = np.roll(read.points, -axis, axis=1).T
+    assert (v <= 0.2 + 1.6 * abs(u - 0.5) + 1e-9).all() and np.allclose(read.normals, first * np.roll([0, 0, 1], axis))
+    assert [np.mean(u < 0.5), np.mean(v < 0.2)] == pytest.approx([0.5, 0.2 / 0.6], abs=0.001)
+
+
 def test_a_glb_stands_upright_at_its_place(tmp_path):
     write_glb(tmp_path / "roof.glb")
     cloud = read_cloud(tmp_path / "roof.glb")

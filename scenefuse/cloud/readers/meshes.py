@@ -7,6 +7,7 @@ import io
 import json
 import re
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -123,20 +124,63 @@ def _colors(mesh: Mesh, face: NDArray[np.int64], weights: Array) -> Array | None
     return colors
 
 
-def triangles(polygons: list[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Polygons as fans of triangles: corners (F, 3), and the polygon of each (F,)."""
-    lengths = np.array([len(polygon) for polygon in polygons], np.int64)
+def triangles(
+    lengths: NDArray[np.int64], rows: NDArray[np.int64], vertices: Array
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Polygons as triangles: fans where these do not fold over.
+
+    Args:
+        lengths: (P,) corners of each.
+        rows: (N,) of all corners, polygon by polygon, in `vertices` (V, 3).
+
+    Returns:
+        (F, 3) places of the triangles' corners in `rows`; (F,) the polygon of each.
+    """
+    starts = np.cumsum(lengths) - lengths
     corners, of = [], []
     for length in np.unique(lengths[lengths >= 3]):
-        rows = np.flatnonzero(lengths == length)
-        same = np.array([polygons[row] for row in rows], np.int64)
-        for k in range(1, length - 1):
-            corners.append(same[:, [0, k, k + 1]])
-            of.append(rows)
+        same = np.flatnonzero(lengths == length)
+        fan = np.stack([np.zeros(length - 2, np.int64), np.arange(1, length - 1), np.arange(2, length)], axis=1)
+        found = starts[same, None, None] + fan
+        if length > 3:
+            at = vertices.take(rows[starts[same, None] + np.arange(length)], axis=0, mode="clip")
+            arms = at[:, 1:] - at[:, :1]
+            normals = np.cross(arms[:, :-1], arms[:, 1:])
+            folded = (np.einsum("ntk,nk->nt", normals, normals.sum(1)) < 0).any(1)
+            for k in np.flatnonzero(folded):
+                found[k] = starts[same[k]] + _ears(at[k], normals[k].sum(0))
+        corners.append(found.reshape(-1, 3))
+        of.append(np.repeat(same, length - 2))
     if not corners:
         return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
     order = np.argsort(np.concatenate(of), kind="stable")
     return np.concatenate(corners)[order], np.concatenate(of)[order]
+
+
+def _ears(points: Array, normal: Array) -> NDArray[np.int64]:
+    """(N - 2, 3) triangles of a polygon (N, 3) with a normal, by clipping its ears (Meisters 1975)."""
+    seen = np.argmax(abs(normal))  # from along this axis
+    flat = np.roll(points, -1 - seen, axis=1)[:, :2] * [np.sign(normal[seen]), 1]
+
+    def side(a: int, b: int, corners: Any) -> Any:
+        """Positive for corners that lie left of the line from a to b."""
+        (x, y), far = flat[b] - flat[a], flat[corners] - flat[a]
+        return x * far[..., 1] - y * far[..., 0]
+
+    left, found, k, tried = list(range(len(points))), [], 0, 0
+    while len(left) > 3:
+        before, corner, after = left[k - 1], left[k], left[(k + 1) % len(left)]
+        ear = side(before, corner, after) > 0
+        if ear:
+            sides = [side(before, corner, left), side(corner, after, left), side(after, before, left)]
+            ear = not (np.min(sides, axis=0) > 0).any()
+        if ear or tried == len(left):  # a knot has no ears
+            found.append((before, corner, after))
+            del left[k]
+            k, tried = max(k - 1, 0), 0
+        else:
+            k, tried = (k + 1) % len(left), tried + 1
+    return np.array([*found, tuple(left)])
 
 
 @dataclass
@@ -188,15 +232,17 @@ def read_obj(path: Path) -> Columns:
     if not content.polygons:
         columns: Columns = dict(zip("xyz", table[:, :3].T))
         return columns if colors is None else columns | dict(zip(COLOR, colors.T))
-    faces, of = triangles(content.polygons)
-    uvs = np.array([*content.uvs, [np.nan, np.nan]], np.float64)[triangles(content.places)[0]]
+    lengths = np.array([len(polygon) for polygon in content.polygons])
+    rows, places = (np.fromiter(chain.from_iterable(some), np.int64) for some in (content.polygons, content.places))
+    corners, of = triangles(lengths, rows, table[:, :3])
+    uvs = np.array([*content.uvs, [np.nan, np.nan]], np.float64)[places[corners]]
     files = [file for name in content.libraries for file in _libraries(path.parent, name)]
     known = dict(pair for file in files for pair in _materials(file).items())
     names = sorted(set(content.used))
     material = np.array([names.index(name) for name in content.used])[of]
     materials = tuple(known.get(name, Material()) for name in names) if known else ()
     painted = None if colors is None else colors.astype(np.float64)
-    return sampled_columns(Mesh(table[:, :3], faces, painted, uvs, material, materials))
+    return sampled_columns(Mesh(table[:, :3], rows[corners], painted, uvs, material, materials))
 
 
 def _row(cell: str, count: int) -> int:

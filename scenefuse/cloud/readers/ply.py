@@ -104,8 +104,10 @@ def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
         return
     colors = colors_of(dict(zip(common_names(list(vertex)), vertex.values())))
     colors = None if colors is None else bytes_of(colors).astype(np.float64)
-    corners = triangles(faces)[0]
-    yield sampled_columns(Mesh(positions(vertex), corners, colors, None, np.full(len(corners), -1)))
+    points = positions(vertex)
+    rows = np.concatenate(faces).astype(np.int64)
+    corners = rows[triangles(np.array([len(face) for face in faces]), rows, points)[0]]
+    yield sampled_columns(Mesh(points, corners, colors, None, np.full(len(corners), -1)))
 
 
 def check_size(path: Path, elements: list[Element], offset: int, advice: str = "copy it again") -> None:
