@@ -23,12 +23,10 @@ OWN_SETTINGS = Path("config/config.yaml")
 MAX_VALUES = 10_000
 T = TypeVar("T")
 # A JSON schema's validator to which NaN and infinity are no numbers.
-_Validator = jsonschema.validators.extend(
-    jsonschema.Draft202012Validator,
-    type_checker=jsonschema.Draft202012Validator.TYPE_CHECKER.redefine(
-        "number", lambda _, x: isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x)
-    ),
+_TYPES = jsonschema.Draft202012Validator.TYPE_CHECKER.redefine(
+    "number", lambda _, value: type(value) in (int, float) and math.isfinite(value)
 )
+_Validator = jsonschema.validators.extend(jsonschema.Draft202012Validator, type_checker=_TYPES)
 
 
 class _UniqueKeys(yaml.SafeLoader):

@@ -80,8 +80,9 @@ def _split(lines: Iterable[str], path: Path) -> Iterator[list[str]]:
     for row in csv.reader(lines, delimiter="\t"):
         broken = next((cell for cell in row if re.search("[\t\n]", cell)), None)
         if broken is not None:
-            begin = re.split("[\t\n]", broken)[0]
-            raise StageError(f"{path}: the quote before {begin} makes one cell of several lines or columns; remove it")
+            raise StageError(
+                f"{path}: the quote before {' '.join(broken.split())[:30]} takes several cells into one; remove it"
+            )
         yield row
 
 

@@ -60,21 +60,21 @@ def camera_files(given: Path) -> list[Path]:
     if given.is_file():
         listed, coords = bundler_list(given), given.parent.parent / COORDS
         return [given, *([listed] if listed else []), *([coords] if coords.is_file() else [])]
-    exported = [file for export in exports_in(given) for file in camera_files(export)]
+    exported = [file for export in exports(given) for file in camera_files(export)]
     models = [model / name for model in colmap_models(given) for name in MODEL_FILES]
     places = [given / name for name in [*CAMERA_FILES, COORDS]]
     return [file for file in [*models, *places] if file.is_file()] or exported or [given]
 
 
-def exports_in(folder: Path) -> list[Path]:
+def exports(folder: Path) -> list[Path]:
     """Metashape's XML and Bundler's files in a folder."""
     begin = {".xml": b"<chunk", BUNDLER: b"# Bundle"}
     files = sorted(folder.iterdir()) if folder.is_dir() else []
     marks = [(file, begin.get(file.suffix.lower())) for file in files if file.is_file()]
-    return [file for file, mark in marks if mark and mark in beginning(file)]
+    return [file for file, mark in marks if mark and mark in head(file)]
 
 
-def beginning(file: Path) -> bytes:
+def head(file: Path) -> bytes:
     """Enough of a file to know its format; nothing of one that cannot be read."""
     try:
         with open(file, "rb") as stream:
@@ -152,17 +152,15 @@ def masks_by_name(photos: Iterable[str], folder: Path) -> dict[str, Path]:
     """The masks below a folder by the names of their photos: for each photo the one that is named as a mask, else the
     one named like the photo; where the folder has both kinds, a file of a photo's whole name is this photo itself."""
     files, photos = pictures_below(folder), list(photos)
-    marked = [name for name, path in files.items() if MASK.fullmatch(_stem(path.name.casefold(), None))]
-    found = photos_by_name(photos, marked, str(folder), MASK)
-    whole = {key for photo in photos if found for key in _keys(photo)[1:2]}
+    marked = [name for name, path in files.items() if MASK.fullmatch(_stem(path.name.casefold()))]
+    found = photos_by_name(photos, marked, str(folder), True)
+    whole = {_keys(photo)[1] for photo in photos if found}
     plain = [name for name in files if name not in found.values() and whole.isdisjoint(_keys(name))]
     found |= photos_by_name([photo for photo in photos if photo not in found], plain, str(folder))
     return {photo: files[name] for photo, name in found.items()}
 
 
-def photos_by_name(
-    wanted: Iterable[str], known: Iterable[str], where: str, mark: re.Pattern[str] | None = None
-) -> dict[str, str]:
+def photos_by_name(wanted: Iterable[str], known: Iterable[str], where: str, masks: bool = False) -> dict[str, str]:
     """Which photo is meant by each name that another program, a list or a person gives; those not there are left out.
 
     Names are compared from their end, folder by folder, as far as they agree: other machines' paths, and frames with
@@ -174,21 +172,21 @@ def photos_by_name(
         wanted: names as given.
         known: paths of photos below their folder.
         where: the file that gives the names, for messages.
-        mark: what names of `known` may be besides their endings, as those of masks are; its groups are a photo's.
+        masks: whether `known` are masks, which may be named as such.
 
     Raises:
         StageError: a name may be of several photos, or a photo of several names.
     """
     index = defaultdict[_Key, list[str]](list)
     for name in dict.fromkeys(known):
-        for key in dict.fromkeys(_keys(name, mark)):
+        for key in dict.fromkeys(_keys(name, masks)):
             index[key].append(name)
     claims: list[tuple[int, str, str]] = []
     for name in dict.fromkeys(wanted):
         keys = _keys(name)
         key = next((key for key in keys if key in index), ("", ""))
         alike = index.get(key, [])
-        whole = [photo for photo in alike if key in _keys(photo, mark)[:3]]
+        whole = [photo for photo in alike if key in _keys(photo, masks)[:3]]
         if len(whole) == 1 or len(alike) == 1:
             claims.append((len(key[1]), name, (whole if len(whole) == 1 else alike)[0]))
         elif key in keys[:3]:
@@ -224,11 +222,13 @@ def _shared_folders(one: str, other: str) -> int:
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def _keys(name: str, mark: re.Pattern[str] | None = None) -> list[_Key]:
+def _keys(name: str, mask: bool = False) -> list[_Key]:
     """What names have in common that may be of one photo: three keys of the whole name, then of less and less of it."""
     parts = _parts(name)
     *folders, last = [part.casefold() for part in parts] or [""]
-    stem = _stem(last, mark)
+    stem = _stem(last)
+    if mask and (marked := MASK.fullmatch(stem)):
+        stem = _stem(marked[1] or marked[2])
     keys: list[_Key] = []
     for k in range(len(parts)):
         spelled = "_".join(parts[k:])
@@ -237,12 +237,11 @@ def _keys(name: str, mark: re.Pattern[str] | None = None) -> list[_Key]:
     return keys
 
 
-def _stem(name: str, mark: re.Pattern[str] | None) -> str:
-    """A name without its endings, however many, and without a mark."""
+def _stem(name: str) -> str:
+    """A name without its endings, however many."""
     while (path := Path(name)).suffix in (*SUFFIXES, *UNREADABLE):
         name = path.stem
-    marked = mark.fullmatch(name) if mark else None
-    return name if marked is None else _stem(marked[1] or marked[2], None)
+    return name
 
 
 def in_folders(names: list[str]) -> str:

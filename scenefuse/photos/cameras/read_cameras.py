@@ -20,16 +20,7 @@ from scenefuse.core.transforms import Array
 from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, PosedPhoto, colmap_camera, largest
 from scenefuse.photos.cameras.json_cameras import TRANSFORMS, find_opensfm, opensfm_place, read_opensfm, read_transforms
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
-from scenefuse.photos.photo_files import (
-    BUNDLER,
-    CAMERA_FILES,
-    beginning,
-    bundler_list,
-    colmap_models,
-    exports_in,
-    files_by_name,
-    stored_size,
-)
+from scenefuse.photos.photo_files import BUNDLER, bundler_list, colmap_models, exports, files_by_name, head, stored_size
 
 Found = TypeVar("Found")
 LAYOUTS = (
@@ -120,18 +111,17 @@ def _format_of(cameras: Path) -> tuple[Path, str]:
             return cameras / name, program
     if colmap_models(cameras):
         return cameras, "COLMAP"
-    exports = exports_in(cameras)
-    if len(exports) > 1:
-        first, second = (file.name for file in exports[:2])
-        raise StageError(f"{cameras} holds cameras in {first} and in {second}; give one of these files")
-    if exports:
-        return exports[0], _program_of(exports[0])
+    found = exports(cameras)
+    if len(found) == 1:
+        return found[0], _program_of(found[0])
+    if found:
+        raise StageError(f"{cameras} holds cameras in {found[0].name} and in {found[1].name}; give one of these files")
     raise StageError(f"{cameras} holds no cameras in a known format; give {LAYOUTS}, or a folder with one")
 
 
 def _program_of(file: Path) -> str:
     """The program whose format a file has; StageError where that is not read."""
-    begin, ending = beginning(file), file.suffix.lower()
+    begin, ending = head(file), file.suffix.lower()
     for pattern, (whose, advice) in UNREAD.items():
         if any(re.search(pattern, text, re.IGNORECASE) for text in (file.name, begin.decode("latin-1"))):
             raise StageError(f"{file} is not read, for it is {whose}; {advice}")
@@ -139,7 +129,7 @@ def _program_of(file: Path) -> str:
         return "Bundler" if ending == BUNDLER else "Metashape"
     if file.name.startswith("reconstruction"):
         return "OpenSfM"
-    if ending != ".json" or (file.name not in CAMERA_FILES and '"frames"' not in read_text(file)):
+    if ending != ".json" or (file.name not in TRANSFORMS and '"frames"' not in read_text(file)):
         raise StageError(f"{file} holds no cameras in a known format; give {LAYOUTS}, or a folder with one")
     return TRANSFORMS.get(file.name, "nerfstudio")
 
