@@ -84,7 +84,8 @@ def text_layout(path: Path) -> TextLayout:
     two with the row and column of a scanner, are left out, and so is what follows.
 
     Raises:
-        StageError: longitude and latitude; commas as decimal points; a row of another length.
+        StageError: longitude and latitude; commas as decimal points; a row of another length; a raster or PTX; names in
+            another order than x, y, z that are not so many as the columns.
         ValueError: no rows of numbers.
     """
     head = [_decoded(line) for line in islice(_lines(path), MAX_HEAD_LINES)]
@@ -335,7 +336,7 @@ def _first_row(path: Path, head: list[str]) -> tuple[int, str | None, int, bool]
 def _indices(rows: NDArray[np.float64]) -> int:
     """How many of the first of (N, C) columns number the points: 1, one after the other, or whole numbers, each once,
     before coordinates that are not whole where x, y, z and colours or normals would be a column fewer or more; or 2, as
-    in a scanner's grid, where what follows is x, y, z, and colours or whole numbers."""
+    in a scanner's grid, where what follows is x, y, z, and colours, whole numbers or an intensity of 0 to 1."""
     first, columns = rows[:, 0], rows.shape[1]
     if columns <= 3 or len(rows) <= 3:
         return 0
