@@ -172,10 +172,23 @@ def _unfolded(points: Array, faces: Rows, side: int) -> Array:
     import open3d as o3d
 
     tensor = o3d.core.Tensor.from_numpy
-    mesh = o3d.t.geometry.TriangleMesh(tensor((points - points.mean(0)).astype(np.float32)), tensor(faces))
+    loose = _beyond_manifold(faces)
+    corners = np.append(points, points[faces[loose]].reshape(-1, 3), axis=0) - points.mean(0)
+    faces = faces.copy()
+    faces[loose] = np.arange(len(points), len(corners)).reshape(-1, 3)
+    mesh = o3d.t.geometry.TriangleMesh(tensor(corners.astype(np.float32)), tensor(faces))
     mesh.compute_uvatlas(size=side, parallel_partitions=threads(), nthreads=threads())
     uv = mesh.triangle.texture_uvs.numpy().astype(np.float64)
     return np.stack([uv[..., 0], 1 - uv[..., 1]], axis=-1)
+
+
+def _beyond_manifold(faces: Rows) -> NDArray[np.bool_]:
+    """(F,) faces with an edge in the direction in which another has it already; UVAtlas takes a manifold only."""
+    edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    first = np.unique(edges, axis=0, return_index=True)[1]
+    again = np.ones(len(edges), dtype=bool)
+    again[first] = False
+    return again.reshape(-1, 3).any(1)
 
 
 def best_worth(worth: Array) -> Array:

@@ -232,6 +232,19 @@ def test_a_planted_picture_lands_on_the_faces_that_a_photo_shows_it_on(closed):
     assert np.allclose(color[middle[:, 2] < -0.5], 100, atol=2)
 
 
+def test_a_surface_on_which_three_faces_share_an_edge_gets_its_texture():
+    """As where a sleeve touches a coat; UVAtlas takes manifold meshes only."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0.3, 1.0]])
+    faces = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]])
+    grey = np.full((5, 3), 100, np.uint8)
+    vertices = Cloud(corners, np.zeros((5, 3), np.float32), grey, {"deviation": np.zeros(5, np.float32)})
+    surface = Surface(vertices, faces, np.full(3, FaceClass.MEASURED, np.uint8), 0.0)
+    photo = np.random.default_rng(0).integers(98, 103, (800, 800, 3)).astype(np.uint8)
+    painted = textured(surface, from_above(1), lambda k: photo)
+    at = np.floor(painted.uv.mean(1) * len(painted.picture)).astype(int)
+    assert len(at) == 3 and np.allclose(painted.picture[at[:, 1], at[:, 0]], 100, atol=5)
+
+
 def test_a_photo_fades_out_towards_where_it_ends():
     """A plane in two photos; one ends in its middle, and is brighter there."""
     x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21)))
