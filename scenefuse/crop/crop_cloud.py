@@ -15,6 +15,9 @@ from scenefuse.core.transforms import UP, Array, rotation_between
 from scenefuse.geometry.ground import Ground, fit_ground
 from scenefuse.geometry.surface import SCORE_FRACTION
 
+# A part this near to a fiducial belongs to the object, and this near beside one that is below the surface nothing is
+# ground; as a share of the diagonal.
+REACH_FRACTION = 0.05
 # Points closer than this belong to one part, as a share of the diagonal of the fiducials' box.
 LINK_FRACTION = 0.03
 # A step is left out if less than this share of the points in the box would be left: the object is there.
@@ -144,7 +147,7 @@ def _without_loose_parts(
     if not len(rows):
         return inside, []
     link = max(LINK_FRACTION * diagonal, 3 * spacing(points[rows]))
-    near = _parts_near(points[rows], marks, link, 2 * SCORE_FRACTION * diagonal)
+    near = _parts_near(points[rows], marks, link, REACH_FRACTION * diagonal)
     if not near.any():
         return inside, ["no part in the box lies near a fiducial: all of them were kept"]
     if near.mean() < MIN_LEFT:
@@ -230,7 +233,7 @@ def on_ground(points: Array, marks: Array, ground: Ground, in_box: NDArray[np.bo
     level &= z <= foot[2] + FOOT_SHARE * height + uphill
     buried = marks[(under - marks[:, 2] > ground.tolerance) & (marks[:, 2] >= foot[2])]
     if len(buried):
-        level &= cKDTree(buried[:, :2]).query(xy, workers=threads())[0] > 2 * SCORE_FRACTION * diagonal
+        level &= cKDTree(buried[:, :2]).query(xy, workers=threads())[0] > REACH_FRACTION * diagonal
     rows = rows[level]
     around = ~in_box[rows] & (z >= surface - ground.tolerance)[level]
     found = np.zeros(len(points), dtype=bool)

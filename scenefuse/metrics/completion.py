@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, plane_normals, sampled, spacing
 from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import Array
-from scenefuse.register.fine import NORMAL_NEIGHBOURS, AgreementSettings
+from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
+from scenefuse.register.score import AgreementSettings
 
 MEASURES = ("surface_variation", "nue", "nue_density_invariant", "primitive_fitting_score")
 # Candidates for a primitive, of each kind, in a round.

@@ -12,7 +12,7 @@ from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, rotation_between
 from scenefuse.fuse.write import Source
 from scenefuse.metrics.completion import MetricSettings, completion_metrics, completion_of, variation_radius
-from scenefuse.register.fine import registration_metrics
+from scenefuse.register.score import registration_metrics
 
 
 def compute_metrics(

@@ -21,7 +21,7 @@ from scenefuse.core.job_records import JobRecords
 from scenefuse.core.stage import StageError, atomic_file, read_json, setting, value
 from scenefuse.core.transforms import Sim3, fit_sim3
 from scenefuse.photos.workspace import posed_images, read_model
-from scenefuse.register.fine import AgreementSettings, registration_metrics
+from scenefuse.register.score import AgreementSettings, registration_metrics
 from scenefuse.report.run_summary import ObjectSummary, RunInputs, summarise
 from scenefuse.report.values import Fields, find, load, number
 

@@ -1,5 +1,4 @@
-"""Fine registration: the stage around `refine_hypotheses`, its report, and how well a registered object and the scene
-crop agree, in numbers (method R10, R11, G1) and in a picture."""
+"""Fine registration: the stage around `refine_hypotheses`, its report and its picture (method R10, R11)."""
 
 import time
 from dataclasses import dataclass
@@ -8,14 +7,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, sampled, spacing
-from scenefuse.core.stage import atomic_file, quantity, read_json, threads, value, write_json
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.stage import atomic_file, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.depth_test import FreeSpace, read_free_space
 from scenefuse.geometry.icp import ScaleRange
-from scenefuse.geometry.surface import NORMAL_NEIGHBOURS, SAMPLED_POINTS, SCORE_FRACTION, normals_at
+from scenefuse.geometry.surface import SAMPLED_POINTS, SCORE_FRACTION
 from scenefuse.photos.pictures import write_picture
 from scenefuse.register.coarse import Candidate
 from scenefuse.register.decision import DecidedBy, FineSettings, tilt_deg
@@ -210,68 +208,6 @@ def scale_ledger(
 def ledger_row(name: str, scale: float, sd_log: float | None, use: str) -> dict[str, Any]:
     """One estimate of the scale."""
     return {"name": name, "scale": scale, "sd_log": sd_log, "use": use}
-
-
-@dataclass(frozen=True)
-class AgreementSettings:
-    """When points correspond."""
-
-    tau_fraction: float = 0.016
-    """Distance within which points correspond, as a share of the crop's diagonal."""
-
-
-def registration_metrics(
-    obj: Cloud, scene: Cloud, scene_from_object: Sim3, tau: float, diagonal: float, unit: str
-) -> dict[str, dict[str, Any]]:
-    """The registration.* numbers of one pose.
-
-    The object's inliers are its points with a scene point within tau. The names without a suffix are the paper's:
-    fitness = share of scene points with an object point within tau (the paper divides by the target); inlier_rmse = RMS
-    distance of the object's inliers to their nearest scene points; normal_consistency = mean |n . n_nearest| over these
-    pairs (chance 0.5). Beside them: fitness_source = share of the object's points that are inliers (Open3D's fitness);
-    fitness_f_score = harmonic mean of both fitnesses; normal_consistency_self = mean |n . n'| between points and their
-    neighbours in both whole clouds together.
-
-    Args:
-        obj: the object in its own frame.
-        scene: the scene's points on the object.
-        scene_from_object: the pose.
-        tau: inlier distance.
-        diagonal: of the full variant's crop.
-        unit: of the scene's lengths.
-    """
-    moved = scene_from_object.apply(obj.points)
-    ahead, partner = cKDTree(scene.points).query(moved, workers=threads())
-    back = cKDTree(moved).query(scene.points, workers=threads())[0]
-    inlier = ahead <= tau
-    source, target = float(inlier.mean()), float((back <= tau).mean())
-    rmse = float(np.sqrt((ahead[inlier] ** 2).mean())) if inlier.any() else None
-    normals_object, normals_scene = (normals_at(points, points) for points in (moved, scene.points))
-    facing = np.abs((normals_object[inlier] * normals_scene[partner[inlier]]).sum(1))
-    return {
-        "fitness": quantity(target, "1"),
-        "fitness_source": quantity(source, "1"),
-        "fitness_f_score": quantity(2 * source * target / max(source + target, 1e-12), "1"),
-        "inlier_rmse": quantity(rmse, unit),
-        "inlier_rmse_over_diagonal": quantity(None if rmse is None else rmse / diagonal, "1"),
-        "normal_consistency": quantity(float(facing.mean()) if inlier.any() else None, "1"),
-        "normal_consistency_self": quantity(self_consistency(np.concatenate([moved, scene.points])), "1"),
-        "tau": quantity(tau, unit),
-        "object_spacing": quantity(spacing(moved), unit),
-        "scene_spacing": quantity(spacing(scene.points), unit),
-    }
-
-
-def self_consistency(points: Array) -> float:
-    """Mean |n . n'| between points (N, 3) and their neighbours: how smooth a surface is, whatever it is of (method G1).
-
-    Measured at SAMPLED_POINTS points at most; neighbours and normals are those of the whole cloud.
-    """
-    tree, at = cKDTree(points), sampled(points, SAMPLED_POINTS, seed=0)
-    neighbours = tree.query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
-    used, place = np.unique(neighbours, return_inverse=True)
-    normals = normals_at(points, points[used])[place.reshape(neighbours.shape)]
-    return float(np.abs(np.einsum("nk,njk->nj", normals[:, 0], normals[:, 1:])).mean())
 
 
 def draw_alignment(path: Path, cloud: Cloud, scene: Cloud, scene_from_object: Sim3, seed: int) -> None:

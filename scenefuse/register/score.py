@@ -1,13 +1,17 @@
-"""How well a pose explains two surfaces: two-way F-score, colours, free space; and hypotheses ranked by it."""
+"""How well a pose explains two surfaces: two-way F-score, colours, free space; hypotheses ranked
+by it; and the registration.* numbers of a pose (method G1)."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from scenefuse.cloud.clouds import Cloud, sampled, spacing
+from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.geometry.depth_test import FreeSpace
-from scenefuse.geometry.surface import Pairs, Surface, pair
+from scenefuse.geometry.surface import NORMAL_NEIGHBOURS, SAMPLED_POINTS, Pairs, Surface, normals_at, pair
 
 # Beta of the F-beta score: recall weighs more, since the scene shows only a part of the object.
 RECALL_WEIGHT = 2.0
@@ -169,3 +173,65 @@ def distinct(
     turn = rotation_angle_deg(a.rotation @ b.rotation.T)
     scale_log = abs(np.log(a.scale / b.scale))
     return bool(turn > angle_deg or scale_log > DISTINCT_SCALE_LOG or apart > shift * diagonal)
+
+
+@dataclass(frozen=True)
+class AgreementSettings:
+    """When points correspond."""
+
+    tau_fraction: float = 0.016
+    """Distance within which points correspond, as a share of the crop's diagonal."""
+
+
+def registration_metrics(
+    obj: Cloud, scene: Cloud, scene_from_object: Sim3, tau: float, diagonal: float, unit: str
+) -> dict[str, dict[str, Any]]:
+    """The registration.* numbers of one pose.
+
+    The object's inliers are its points with a scene point within tau. The names without a suffix are the paper's:
+    fitness = share of scene points with an object point within tau (the paper divides by the target); inlier_rmse = RMS
+    distance of the object's inliers to their nearest scene points; normal_consistency = mean |n . n_nearest| over these
+    pairs (chance 0.5). Beside them: fitness_source = share of the object's points that are inliers (Open3D's fitness);
+    fitness_f_score = harmonic mean of both fitnesses; normal_consistency_self = mean |n . n'| between points and their
+    neighbours in both whole clouds together.
+
+    Args:
+        obj: the object in its own frame.
+        scene: the scene's points on the object.
+        scene_from_object: the pose.
+        tau: inlier distance.
+        diagonal: of the full variant's crop.
+        unit: of the scene's lengths.
+    """
+    moved = scene_from_object.apply(obj.points)
+    ahead, partner = cKDTree(scene.points).query(moved, workers=threads())
+    back = cKDTree(moved).query(scene.points, workers=threads())[0]
+    inlier = ahead <= tau
+    source, target = float(inlier.mean()), float((back <= tau).mean())
+    rmse = float(np.sqrt((ahead[inlier] ** 2).mean())) if inlier.any() else None
+    normals_object, normals_scene = (normals_at(points, points) for points in (moved, scene.points))
+    facing = np.abs((normals_object[inlier] * normals_scene[partner[inlier]]).sum(1))
+    return {
+        "fitness": quantity(target, "1"),
+        "fitness_source": quantity(source, "1"),
+        "fitness_f_score": quantity(2 * source * target / max(source + target, 1e-12), "1"),
+        "inlier_rmse": quantity(rmse, unit),
+        "inlier_rmse_over_diagonal": quantity(None if rmse is None else rmse / diagonal, "1"),
+        "normal_consistency": quantity(float(facing.mean()) if inlier.any() else None, "1"),
+        "normal_consistency_self": quantity(self_consistency(np.concatenate([moved, scene.points])), "1"),
+        "tau": quantity(tau, unit),
+        "object_spacing": quantity(spacing(moved), unit),
+        "scene_spacing": quantity(spacing(scene.points), unit),
+    }
+
+
+def self_consistency(points: Array) -> float:
+    """Mean |n . n'| between points (N, 3) and their neighbours: how smooth a surface is, whatever it is of (method G1).
+
+    Measured at SAMPLED_POINTS points at most; neighbours and normals are those of the whole cloud.
+    """
+    tree, at = cKDTree(points), sampled(points, SAMPLED_POINTS, seed=0)
+    neighbours = tree.query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
+    used, place = np.unique(neighbours, return_inverse=True)
+    normals = normals_at(points, points[used])[place.reshape(neighbours.shape)]
+    return float(np.abs(np.einsum("nk,njk->nj", normals[:, 0], normals[:, 1:])).mean())

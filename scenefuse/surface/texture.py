@@ -188,7 +188,7 @@ def _beyond_manifold(faces: Rows) -> NDArray[np.bool_]:
     first = np.unique(edges, axis=0, return_index=True)[1]
     again = np.ones(len(edges), dtype=bool)
     again[first] = False
-    return again.reshape(-1, 3).any(1)
+    return np.asarray(again.reshape(-1, 3).any(1))
 
 
 def best_worth(worth: Array) -> Array:

@@ -19,8 +19,9 @@ from scenefuse.metrics.truth import fit_cameras, read_cameras, read_posed, regis
 from scenefuse.paper.register_as_paper import register_as_paper
 from scenefuse.register.coarse import CoarseSettings, register_coarsely
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.fine import AgreementSettings, ConstraintFiles, register_finely, registration_metrics
+from scenefuse.register.fine import ConstraintFiles, register_finely
 from scenefuse.register.problem import Inputs, ScaleSettings
+from scenefuse.register.score import AgreementSettings, registration_metrics
 
 OBJECTS = ("house", "balloon", "sculpture")
 

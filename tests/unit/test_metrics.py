@@ -8,6 +8,7 @@ import pytest
 from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import quantity, read_json, write_json
 from scenefuse.core.transforms import Sim3, rotation_between
+from scenefuse.geometry.surface import SAMPLED_POINTS
 from scenefuse.metrics.completion import (
     Completion,
     MetricSettings,
@@ -18,7 +19,7 @@ from scenefuse.metrics.completion import (
     surface_variation,
 )
 from scenefuse.metrics.compute_metrics import box_size, compute_metrics, compute_scene_metrics
-from scenefuse.register.fine import SAMPLED_POINTS, registration_metrics, self_consistency
+from scenefuse.register.score import registration_metrics, self_consistency
 
 SETTINGS = MetricSettings(
     variation_spacings=8.0,

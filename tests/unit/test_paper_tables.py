@@ -27,7 +27,7 @@ from scenefuse.paper.compare_with_paper import (
     published,
 )
 from scenefuse.photos.workspace import View, write_model
-from scenefuse.register.fine import registration_metrics
+from scenefuse.register.score import registration_metrics
 from scenefuse.report.run_summary import RunInputs
 from scenefuse.report.values import load
 from scenefuse.report.write_report import write_report

@@ -380,7 +380,7 @@ def test_metashape_reads_the_cameras_and_their_place(tmp_path: Path):
     write_model(workspace / "sparse", from_above(3))
     write_json(tmp_path / "g.json", GEOREFERENCE)
     export_cameras(scene_workspace=workspace, objects=[], georeference_json=tmp_path / "g.json", folder=folder)
-    found = {given.name: given for given in read_metashape(folder / "cameras.xml")}
+    found = {given.name: given for given in read_metashape(folder / "cameras.xml")[0]}
     for view in from_above(3):
         assert np.allclose(found[Path(view.name).stem].object_from_cam, view.world_from_cam)
         lens = found[Path(view.name).stem].camera

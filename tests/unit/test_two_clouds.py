@@ -370,6 +370,8 @@ def test_the_box_drawn_in_the_page_of_a_refusal_holds_the_object_and_its_command
         assert register(**known, known=Known(up_scene=(0, 0, 1))) == 3
     with chromium("--window-size=1400,900", phone=phone) as window:
         window.open(tmp_path / "out/crop_box.html")
+        window.find(".places button").click()
+        place = np.array(window.find("#command").text.split("--crop-box ")[1].split(), np.float64)
         picture = window.find(".map svg")
         middle, reach, size = (low + high) / 2 + UTM, 0.55 * (high - low), picture.size
         pixel = window.value(
@@ -381,8 +383,6 @@ def test_the_box_drawn_in_the_page_of_a_refusal_holds_the_object_and_its_command
         touch(window, picture, [tuple(place) for place in path], "touch" if phone else "mouse")
         said = window.find("#command").text
         assert window.value("return document.documentElement.scrollWidth <= innerWidth;")
-        window.find(".places button").click()
-        place = np.array(window.find("#command").text.split("--crop-box ")[1].split(), np.float64)
         assert window.complaints() == []
     np.testing.assert_allclose(place, [*(low + UTM), *(high + UTM)], atol=0.05)
     words = shlex.split(said)
