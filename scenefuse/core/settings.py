@@ -3,7 +3,7 @@
 import dataclasses
 import difflib
 import functools
-import math
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -22,9 +22,9 @@ OWN_SETTINGS = Path("config/config.yaml")
 # More values than any settings file has; messages about fewer are still short.
 MAX_VALUES = 10_000
 T = TypeVar("T")
-# A JSON schema's validator to which NaN and infinity are no numbers.
+# A JSON schema's validator to which NaN, infinity and what exceeds a float are no numbers.
 _TYPES = jsonschema.Draft202012Validator.TYPE_CHECKER.redefine(
-    "number", lambda _, value: type(value) in (int, float) and math.isfinite(value)
+    "number", lambda _, value: type(value) in (int, float) and abs(value) <= sys.float_info.max
 )
 _Validator = jsonschema.validators.extend(jsonschema.Draft202012Validator, type_checker=_TYPES)
 

@@ -216,6 +216,10 @@ def test_init_ends_with_the_next_command_by_its_real_names(two_folders, capsys):
             "line 1, scene: nothing stands .* below it; remove the line, or fill it in",
         ),
         ("seed: 1\nregistration:\n  crop:\n    margin: .nan\n", "line 4, registration.crop.margin: nan is not of type"),
+        (
+            f"registration:\n  crop:\n    margin: 1{400 * '0'}\n",
+            "line 3, registration.crop.margin: 10{400} is not of type",
+        ),
         ("registration: {crop: {margin: -.inf}}", "line 1, registration.crop.margin: -inf is not of type"),
         (
             "object: {seed: 1}\nseed: 1\nobject:\n  nerf: {}\n",
