@@ -309,7 +309,6 @@ def _check_near(names: list[str], points: Array, cloud: Cloud, path: Path) -> No
 
 def _report(scene_points: int, part: Cloud, cut: Crop, unit: str) -> dict[str, object]:
     """The stage JSON of a crop."""
-    ground = cut.ground
     return {
         "shape": quantity(cut.shape, ""),
         "up_in_scene": quantity(UP, ""),
@@ -317,14 +316,10 @@ def _report(scene_points: int, part: Cloud, cut: Crop, unit: str) -> dict[str, o
         "box_low": quantity(cut.low, unit),
         "box_high": quantity(cut.high, unit),
         "scene_points": quantity(scene_points, "1"),
-        "box_points": quantity(int(cut.in_box.sum()), "1"),
         "crop_points": quantity(len(part), "1"),
         "diagonal": quantity(part.diagonal, unit),
         "spacing": quantity(spacing(part.points), unit),
         "ground_removed": quantity(bool(cut.on_ground.any()), ""),
         "ground_points": quantity(int(cut.on_ground.sum()), "1"),
-        "ground_coefficients": quantity(None if ground is None else ground.coefficients, unit),
-        "ground_centre": quantity(None if ground is None else ground.centre, unit),
-        "ground_tolerance": quantity(None if ground is None else ground.tolerance, unit),
         "notes": quantity(cut.notes, ""),
     }

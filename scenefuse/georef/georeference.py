@@ -11,7 +11,7 @@ import pycolmap
 
 from scenefuse.cloud.crs import check_in_area, grid_name, projected_crs
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, value, write_json
-from scenefuse.core.transforms import UP, Array, box_corners, fit_sim3
+from scenefuse.core.transforms import Array, box_corners, fit_sim3
 from scenefuse.georef.control import Control, read_control_points
 from scenefuse.georef.on_cloud import lay_on_cloud
 from scenefuse.georef.placement import (
@@ -36,7 +36,7 @@ from scenefuse.photos.geodesy import LocalFrame, local_frame
 from scenefuse.photos.photos import Photo, gps_accuracies, gps_positions, read_photos
 from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.sfm.colmap import Freedom, adjustment_options, drop_outliers
-from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
+from scenefuse.sfm.gravity import estimate_up
 from scenefuse.sfm.lens import LENSES
 
 # How far from its point, in metres, a camera stands that measures a coordinate: its aperture takes no depth in. Also
@@ -116,8 +116,7 @@ def georegister(
         model.write(temporary)
     left = residuals_of(model, found, None if lengths is None else read_lengths(lengths, model, sizes))
     write_residuals(residuals, found, left)
-    _, turned, _ = camera_poses(model)
-    write_json(report, georeference_report(found, left, cue, roll_spread_deg(turned, UP)) | adjustment)
+    write_json(report, georeference_report(found, left, cue) | adjustment)
 
 
 def _in_grid(found: Georeference, crs: str) -> LocalFrame:
@@ -233,9 +232,7 @@ def adjust_georeferenced(model: pycolmap.Reconstruction, found: Georeference, fr
         flush=True,
     )
     return {
-        "adjusted_to_control_points": quantity(len(used), "1"),
         "adjusted_to_positions": quantity(len(photos.names), "1"),
-        "mean_reprojection_error_before_px": quantity(before_px, "px"),
         "mean_reprojection_error_px": quantity(after_px, "px"),
     }
 

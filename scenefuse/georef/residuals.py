@@ -101,7 +101,7 @@ def _length(error: Array) -> float:
     return float(np.sqrt(np.nansum(error**2))) if np.isfinite(error).any() else np.nan
 
 
-def georeference_report(found: Georeference, left: Residuals, cue: str, roll_deg: float) -> dict[str, Any]:
+def georeference_report(found: Georeference, left: Residuals, cue: str) -> dict[str, Any]:
     """Content of georeference.json; what matters of it is printed."""
     placement, gps, unit = found.placement, found.gps, "m" if found.metric else "scene units"
     measured_by = "control points" if found.control else "GPS" if len(placement.inliers) else "given cameras"
@@ -114,10 +114,8 @@ def georeference_report(found: Georeference, left: Residuals, cue: str, roll_deg
         "metric": quantity(found.metric, ""),
         "scene_from_sparse": quantity(transform.matrix, unit),
         "scale": quantity(transform.scale, f"{unit} per unit of the sparse model"),
-        "photos_with_gps": quantity(len(gps.names), "1"),
         "photos_with_gps_height": quantity(int(np.isfinite(gps.positions[:, 2]).sum()), "1"),
         "up_cue": quantity(cue if placement.levelled else measured_by, ""),
-        "camera_roll_median_deg": quantity(roll_deg, "deg"),
     }
     content |= {} if left.lengths is None else _of_lengths(left.lengths, found.placement.status)
     if found.placement.status != "georeferenced" or found.frame is None:
@@ -197,7 +195,6 @@ def _of_cameras(found: Georeference, left: Residuals) -> dict[str, Any]:
     whole = rms(left.cameras[inliers])
     print(f"GPS residuals: median {np.median(distance):.2f} m, RMS of inliers {whole or 0:.2f} m", flush=True)
     content = {
-        "gps_inliers": quantity(int(inliers.sum()), "1"),
         "gps_residual_median_m": quantity(float(np.median(distance)), "m"),
         "gps_residual_rms_m": quantity(whole, "m"),
         "gps_residual_horizontal_rms_m": quantity(rms(left.cameras[inliers, :2]), "m"),

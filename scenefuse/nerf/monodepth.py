@@ -182,11 +182,6 @@ def disparity_from_depth(depth: Tensor, near: float, far: float) -> Tensor:
     return ((1.0 / depth.clamp_min(1e-9) - 1.0 / far) / (1.0 / near - 1.0 / far)).clamp(0.0, 1.0)
 
 
-def parameters(*networks: nn.Module) -> int:
-    """Number of trained values in all networks together."""
-    return sum(p.numel() for network in networks for p in network.parameters())
-
-
 def convolutions(before: int, after: int, stride: int) -> nn.Sequential:
     """Two 3x3 convolutions from `before` to `after` channels, the first one strided."""
     return nn.Sequential(

@@ -114,11 +114,10 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
     # Voxels are no larger than half a window that depths were matched by, which tells no more.
     pixels = settings.refinement.match_window_px // 2
     voxel = min(settings.spacing * diagonal, pixels * footprint(maps.depths, views.intrinsics))
-    thinned = voxel_downsample(raw, voxel)
-    cleaned = with_plane_normals(clean(thinned, settings.gates.min_component, voxel))
+    cleaned = with_plane_normals(clean(voxel_downsample(raw, voxel), settings.gates.min_component, voxel))
     shares = float(refined.moved.sum() / rendered), float(refined.inconsistent.sum() / rendered)
     write_cloud(cloud, cleaned)
-    write_json(report, _report(raw, thinned, cleaned, shares, seed) | known)
+    write_json(report, _report(cleaned, shares, seed) | known)
     print(f"{len(cleaned)} points on a diagonal of {cleaned.diagonal:.4g}", flush=True)
 
 
@@ -239,16 +238,12 @@ def read_maps(stage: Path, views: Views, least_confidence: float) -> SurfaceMaps
     return SurfaceMaps(depths, confidence, normals)
 
 
-def _report(raw: Cloud, thinned: Cloud, cleaned: Cloud, shares: tuple[float, float], seed: int) -> dict[str, Any]:
-    """The cloud at its three stages, and the shares of rendered depths that photos moved and contradicted."""
+def _report(cleaned: Cloud, shares: tuple[float, float], seed: int) -> dict[str, Any]:
+    """The cloud, and the shares of rendered depths that photos moved and contradicted."""
     return {
         "points": quantity(len(cleaned), "1"),
         "refined_share": quantity(shares[0], "1"),
         "inconsistent_share": quantity(shares[1], "1"),
-        "points_before_thinning": quantity(len(raw), "1"),
-        "points_dropped_as_outliers": quantity(len(thinned) - len(cleaned), "1"),
         "spacing": quantity(spacing(cleaned.points, seed=seed), "object units"),
         "diagonal": quantity(cleaned.diagonal, "object units"),
-        "views_per_point": quantity(float(np.mean(cleaned.fields["views"])), "1"),
-        "confidence_mean": quantity(float(np.mean(cleaned.fields["confidence"])), "1"),
     }

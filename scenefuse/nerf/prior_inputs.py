@@ -216,12 +216,10 @@ class NetworkInputs:
     Attributes:
         channels: (V, 9, H, W): colour (3), mask, ray (2), disparity between SfM points, disparity by stereo, its score.
         first: (V, 1, H, W) disparity that the network corrects.
-        between_points: (V, 1, H, W) disparity interpolated between SfM points alone.
     """
 
     channels: Tensor
     first: Tensor
-    between_points: Tensor
 
 
 def network_inputs(photos: DepthPhotos, settings: DepthMapSettings | None = STEREO) -> NetworkInputs:
@@ -243,7 +241,7 @@ def network_inputs(photos: DepthPhotos, settings: DepthMapSettings | None = STER
     first = between + weight * (swept - between)
     colour = (photos.images * 2.0 - 1.0) * photos.masks
     channels = torch.cat([colour, photos.masks * 2 - 1, ray, between * 2 - 1, swept * 2 - 1, score], 1)
-    return NetworkInputs(channels, first, between)
+    return NetworkInputs(channels, first)
 
 
 def _between_points(photos: DepthPhotos, index: int) -> Tensor:

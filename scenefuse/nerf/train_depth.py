@@ -19,11 +19,10 @@ from scenefuse.core.checkpoints import key_of
 from scenefuse.core.stage import atomic_directory, quantity, setting, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.nerf.monodepth import DepthNetwork, depth_from_disparity, parameters, sample
+from scenefuse.nerf.monodepth import DepthNetwork, sample
 from scenefuse.nerf.prior_inputs import (
     STEREO,
     DepthPhotos,
-    NetworkInputs,
     crop_to_object,
     depth_photos,
     network_inputs,
@@ -94,16 +93,16 @@ def train_depth(
     recipe = Recipe(settings.epochs)
     checkpoint = checkpoints / key_of("stage 1", recipe, seed, photos, inputs) / "state.pt"
     losses = train_network(network, photos, inputs, recipe, checkpoint, seed)
-    raw = predict(network, photos, inputs.channels, inputs.first)
-    aligned = align_maps(raw, photos)
+    aligned = align_maps(predict(network, photos, inputs.channels, inputs.first), photos)
     depths = np.zeros(views.masks.shape, np.float32)
     for index, place in enumerate(depths):
         height, width = views.sizes[index]
         place[:height, :width] = crops.paste(index, aligned[index, 0].cpu().numpy())
     prior, confirmed = confirm(views, depths, settings.refinement, settings.map_agreement)
     content: Content = {
-        **_input_quantities(photos, inputs, network),
-        "residual_before_alignment": quantity(residual_at_checks(raw, photos), "1"),
+        "photos": quantity(len(photos.points), "1"),
+        "diagonal": quantity(photos.diagonal, "object units"),
+        "device": quantity(str(device), ""),
         "residual_after_alignment": quantity(residual_at_checks(aligned, photos), "1"),
         **confirmed,
         **loss_quantities(losses),
@@ -115,26 +114,6 @@ def train_depth(
     _print_quality(content)
 
 
-def _input_quantities(photos: DepthPhotos, inputs: NetworkInputs, network: DepthNetwork) -> Content:
-    """What the training had to work with, and how good depth was before it."""
-
-    def residual(disparity: Tensor) -> float | None:
-        return residual_at_checks(depth_from_disparity(disparity, photos.near, photos.far), photos)
-
-    return {
-        "photos": quantity(len(photos.points), "1"),
-        "photos_held_out": quantity(int((~photos.trained).sum()), "1"),
-        "crop_px": quantity([photos.images.shape[3], photos.images.shape[2]], "px"),
-        "nearest_depth": quantity(photos.near, "object units"),
-        "farthest_depth": quantity(photos.far, "object units"),
-        "diagonal": quantity(photos.diagonal, "object units"),
-        "parameters": quantity(parameters(network), "1"),
-        "device": quantity(str(photos.images.device), ""),
-        "residual_between_points": quantity(residual(inputs.between_points), "1"),
-        "residual_before_training": quantity(residual(inputs.first), "1"),
-    }
-
-
 def _print_quality(content: Content) -> None:
     residual, share = content["residual_after_alignment"]["value"], content["confirmed_share"]["value"]
     known = "no SfM points to check" if residual is None else f"median residual at SfM points {residual:.2%}"
@@ -144,11 +123,9 @@ def _print_quality(content: Content) -> None:
 def align_maps(raw: Tensor, photos: DepthPhotos) -> Tensor:
     """Each (1, H, W) depth map aligned to the SfM points of its photo, never to those kept for checking."""
     aligned = []
-    for index, points in enumerate(photos.points):
-        pixels = torch.from_numpy(points[None, :, :2]).to(raw.device)
-        predicted = sample(raw[index : index + 1], pixels)[0, 0].double().cpu().numpy()
+    for maps, predicted, points in zip(raw, depths_at(raw, photos.points), photos.points):
         scale, shift = align_to_points(predicted, points[:, 2].astype(np.float64))
-        aligned.append((scale * raw[index] + shift).clamp_min(1e-3 * photos.near))
+        aligned.append((scale * maps + shift).clamp_min(1e-3 * photos.near))
     return torch.stack(aligned)
 
 
@@ -175,16 +152,14 @@ def align_to_points(predicted: Array, measured: Array) -> tuple[float, float]:
     return options[int(np.nanargmin(costs))]
 
 
-def residuals_at_points(depth: Tensor, points: list[NDArray[np.float32]]) -> list[Array]:
-    """|depth - SfM depth| / SfM depth at each photo's points: V arrays."""
-    result = []
-    for index, p in enumerate(points):
-        found = sample(depth[index : index + 1], torch.from_numpy(p[None, :, :2]).to(depth.device))[0, 0].cpu().numpy()
-        result.append(np.abs(found / p[:, 2] - 1.0))
-    return result
+def depths_at(maps: Tensor, points: list[NDArray[np.float32]]) -> list[Array]:
+    """Depths of (V, 1, H, W) maps at each photo's points (N, 3; column, row, depth): V arrays."""
+    pixels = (torch.from_numpy(of_photo[None, :, :2]).to(maps.device) for of_photo in points)
+    return [sample(depth[None], at)[0, 0].double().cpu().numpy() for depth, at in zip(maps, pixels)]
 
 
 def residual_at_checks(depth: Tensor, photos: DepthPhotos) -> float | None:
     """Median relative residual at the SfM points that no training saw; None where there are none."""
-    residuals = np.concatenate(residuals_at_points(depth, photos.checks))
+    pairs = zip(depths_at(depth, photos.checks), photos.checks)
+    residuals = np.concatenate([np.abs(found / points[:, 2] - 1.0) for found, points in pairs])
     return float(np.median(residuals)) if len(residuals) else None

@@ -249,12 +249,10 @@ def _report(
         "samples_per_second": quantity(round(result["samples_per_second"]), "1/s"),
         "device": quantity(device, ""),
         "kernels": quantity(kernels_on(device), ""),
-        "depth_prior": quantity(prior is not None, ""),
         "prior_confident_share": quantity(prior and _confident_share(prior, given), "1"),
         "hull_share": quantity(float(given.volume.hull.mean()), "1"),
         "diagonal": quantity(maps.diagonal, "object units"),
         **{f"loss_{name}": quantity(value, "1") for name, value in result.items() if name not in NO_LOSSES},
-        "psnr_training": quantity(result.get("psnr"), "dB"),
         "confident_share": quantity(float((maps.confidence > MIN_CONFIDENCE).sum() / given.views.masks.sum()), "1"),
     }
 

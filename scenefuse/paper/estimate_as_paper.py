@@ -16,11 +16,10 @@ from torch import Tensor
 from scenefuse.core.checkpoints import key_of
 from scenefuse.core.stage import StageError, atomic_directory, quantity, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
-from scenefuse.nerf.monodepth import sample
 from scenefuse.nerf.prior_inputs import DepthPhotos, depth_photos
 from scenefuse.nerf.prior_training import Recipe, loss_quantities, optimise, predict, prepare_torch
 from scenefuse.nerf.rendered_maps import DepthPrior, read_stage_maps, write_prior
-from scenefuse.nerf.train_depth import align_maps
+from scenefuse.nerf.train_depth import align_maps, depths_at
 from scenefuse.nerf.train_object_nerf import MIN_CONFIDENCE
 from scenefuse.paper import monocular
 from scenefuse.paper.monocular import Content, MonocularSettings, Networks, Supervision
@@ -260,11 +259,8 @@ def photos_at(poses: Array, views: Views, frames: DepthPhotos) -> DepthPhotos:
 
 def median_ratio(raw: Tensor, known: DepthPhotos) -> float:
     """Depth of SfM points over that of the maps, the median of all frames."""
-    ratios = []
-    for index, points in enumerate(known.points):
-        pixels = torch.from_numpy(points[None, :, :2]).to(raw.device)
-        ratios.append(points[:, 2] / sample(raw[index : index + 1], pixels)[0, 0].cpu().numpy())
-    return float(np.median(np.concatenate(ratios)))
+    pairs = zip(known.points, depths_at(raw, known.points))
+    return float(np.median(np.concatenate([points[:, 2] / found for points, found in pairs])))
 
 
 def in_unit(poses: Array, unit: float) -> Array:

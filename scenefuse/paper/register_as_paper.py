@@ -31,7 +31,7 @@ from scenefuse.geometry.icp import ScaleRange, triples_of_one_scale
 from scenefuse.geometry.surface import SCORE_FRACTION
 from scenefuse.register.coarse import coarse_quantities
 from scenefuse.register.decision import FineSettings, tilt_deg
-from scenefuse.register.fine import draw_alignment, ledger_row, pose_quantities
+from scenefuse.register.fine import draw_alignment, pose_quantities
 from scenefuse.register.problem import (
     SURFACE_POINTS,
     Constraints,
@@ -109,7 +109,7 @@ def register_as_paper(
         draw_alignment(picture, obj, scene, fine.pose, seed)
     write_json(scale_report, scale_quantities(ledger, problem.scales, scale))
     write_json(coarse_report, coarse_quantities([coarse], False, [*said, *notes], between - start))
-    write_json(report, _report(fine, problem, inputs.length_unit(), scale, end - between))
+    write_json(report, _report(fine, problem, inputs.length_unit(), end - between))
 
 
 def _rated(problem: Problem, pose: Sim3, fraction: float, most: int) -> Hypothesis:
@@ -118,7 +118,7 @@ def _rated(problem: Problem, pose: Sim3, fraction: float, most: int) -> Hypothes
     return Hypothesis(pose, "fpfh", score(*problem.surfaces(scale, fraction, most), pose, tau, scale))
 
 
-def _report(best: Hypothesis, problem: Problem, length: str, scale: str, seconds: float) -> dict[str, Any]:
+def _report(best: Hypothesis, problem: Problem, length: str, seconds: float) -> dict[str, Any]:
     """The stage JSON, with the keys of the fine registration's."""
     reason = "the paper's recipe has no gate"
     print(f"ungated: {reason}", flush=True)
@@ -126,17 +126,12 @@ def _report(best: Hypothesis, problem: Problem, length: str, scale: str, seconds
         "status": quantity("ungated", ""),
         "reason": quantity(reason, ""),
         **pose_quantities(best),
-        "scale_over_prior": quantity(best.pose.scale / problem.scales.centre, "1"),
         "decided_by": quantity("geometry", ""),
         "rests_on": quantity(["shape"], ""),
         "margin": quantity(None, "1"),
-        "free_axis": quantity(None, ""),
         "tilt_deg": quantity(tilt_deg(best.pose, problem.known.ups), "deg"),
         **uncertainty_quantities(None, length),
-        "scale_ledger": quantity([ledger_row(scale, problem.scales.centre, None, "held by the paper's recipe")], ""),
-        "score_tau": quantity(SCORE_FRACTION * problem.scene.diagonal, length),
         "source": quantity(best.source, ""),
-        "rival": quantity(None, ""),
         "hypotheses": quantity([best.as_json()], ""),
         "seconds": quantity(seconds, "s"),
     }

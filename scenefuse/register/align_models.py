@@ -291,8 +291,6 @@ def _report(
         "scale": quantity(None if pose is None else pose.scale, "scene units per object unit"),
         "shared_points": quantity(count, "1"),
         "matches": quantity(matches, "1"),
-        "inlier_share": quantity(count / matches if matches else 0.0, "1"),
-        "rival_points": quantity(0 if consensus is None else consensus.rival, "1"),
         "settled_by_gps": quantity(settled, ""),
         "object_photos": quantity(photos[0], "1"),
         "scene_photos": quantity(photos[1], "1"),
@@ -394,8 +392,6 @@ def gps_quantities(gps: GpsPose | None, pose: Sim3 | None, at: Array | None) -> 
     return {
         "gps_photos": quantity(0 if gps is None else gps.photos, "1"),
         "gps_place": quantity(place, "m"),
-        "gps_turn_sd": quantity(None if gps is None else gps.turn_sd, "log scale, radians"),
-        "gps_shift_sd": quantity(None if gps is None else gps.shift_sd, "m"),
         "gps_scale_apart": quantity(scale, "log"),
         "gps_heading_apart_deg": quantity(heading, "deg"),
         "gps_shift_apart": quantity(shift, "m"),

@@ -16,11 +16,11 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import SAMPLED_POINTS, SCORE_FRACTION
 from scenefuse.photos.pictures import write_picture
 from scenefuse.register.coarse import Candidate
-from scenefuse.register.decision import DecidedBy, FineSettings, tilt_deg
-from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, read_alignment
+from scenefuse.register.decision import FineSettings, tilt_deg
+from scenefuse.register.problem import Constraints, Inputs, Problem, read_alignment
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.score import Hypothesis
-from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities, with_bending
+from scenefuse.register.uncertainty import uncertainty_quantities, with_bending
 
 # Photos whose depth maps give the free space; more look from sides that these have seen.
 FREE_SPACE_PHOTOS = 12
@@ -77,7 +77,7 @@ def register_finely(
         scale_json: JSON of the scale, of the coarse stage.
         coarse_json: JSON of the coarse stage.
         known: what is known beside the clouds.
-        report: output JSON: `status`, `reason`, `scene_from_object`, `scale`, scores, `scale_ledger`, every hypothesis.
+        report: output JSON: `status`, `reason`, `scene_from_object`, `scale`, scores, every hypothesis.
         picture: output PNG, the object on the scene crop from three sides.
         seed: of all random choices.
         settings: see FineSettings.
@@ -98,8 +98,7 @@ def register_finely(
     seconds = time.perf_counter() - start
     if picture is not None:
         draw_alignment(picture, obj, scene, outcome.ranked[0].pose, seed)
-    content = _report(outcome, problem, prior, inputs.length_unit(), settings, seconds)
-    write_json(report, content | _stated(outcome, bending, inputs.length_unit()))
+    write_json(report, _report(outcome, problem, seconds) | _stated(outcome, bending, inputs.length_unit()))
 
 
 def read_candidates(coarse_json: Path) -> list[Candidate]:
@@ -108,26 +107,20 @@ def read_candidates(coarse_json: Path) -> list[Candidate]:
     return [(Sim3.from_matrix(np.array(h["scene_from_object"])), h["source"]) for h in found]
 
 
-def _report(
-    outcome: Outcome, problem: Problem, prior: dict[str, Any], length: str, settings: FineSettings, seconds: float
-) -> dict[str, Any]:
+def _report(outcome: Outcome, problem: Problem, seconds: float) -> dict[str, Any]:
     """The stage JSON; the decision is printed."""
     best, decision = outcome.ranked[0], outcome.decision
-    status, alignment = "registered" if decision.registered else "unregistered", problem.known.alignment
+    status = "registered" if decision.registered else "unregistered"
     print(f"{status}: {decision.reason}", flush=True)
-    ledger = scale_ledger(prior, alignment, best, outcome.uncertainty, decision.decided_by)
     return {
         "status": quantity(status, ""),
         "reason": quantity(decision.reason, ""),
         **pose_quantities(best),
-        "scale_over_prior": quantity(best.pose.scale / problem.scales.centre, "1"),
         "decided_by": quantity(decision.decided_by, ""),
         "rests_on": quantity(rests_on(best, problem.known), ""),
         "margin": quantity(decision.margin, "1"),
         "free_axis": quantity(decision.free_axis, ""),
         "tilt_deg": quantity(tilt_deg(best.pose, problem.known.ups), "deg"),
-        "scale_ledger": quantity(ledger, ""),
-        "score_tau": quantity(settings.score_fraction * problem.scene.diagonal, length),
         "source": quantity(best.source, ""),
         "rival": quantity(None if decision.rival is None else decision.rival.as_json(), ""),
         "hypotheses": quantity([h.as_json() for h in outcome.ranked], ""),
@@ -173,41 +166,6 @@ def pose_quantities(best: Hypothesis) -> dict[str, Any]:
         "free_space_violation": quantity(score.free_space_violation, "1"),
         "score": quantity(score.total, "1"),
     }
-
-
-def scale_ledger(
-    prior: dict[str, Any],
-    alignment: Alignment | None,
-    best: Hypothesis,
-    uncertainty: Uncertainty | None,
-    decided_by: DecidedBy,
-) -> list[dict[str, Any]]:
-    """Every estimate of the scale with its standard deviation (log), what it was used for, and which was taken and why.
-
-    The estimates of extent have no standard deviation of their own: what one side lacks biases them, so they only
-    centre a prior.
-    """
-    rows = [
-        ledger_row(e["name"], e["scale"], None, "centres the prior" if e["used"] else "none")
-        for e in value(prior, "ledger")
-    ]
-    by_photos = alignment is not None and best.pose is alignment.pose
-    if alignment is not None:
-        relation = "and the clouds agree" if decided_by == "both" else "the clouds' best fit is another pose"
-        otherwise = "none: its pose lies in free space" if decided_by == "near" else "confirms"
-        use = f"taken: less uncertain than the clouds; {relation}" if by_photos else otherwise
-        rows.append(ledger_row("shared points", alignment.pose.scale, alignment.uncertainty.scale_sd_log, use))
-    if not by_photos:
-        agrees = ", and the photos agree" if decided_by == "both" else ""
-        own = None if uncertainty is None else uncertainty.scale_sd_log
-        use = f"taken: the clouds' best fit inside the prior{agrees}"
-        rows.append(ledger_row("clouds", best.pose.scale, own, use))
-    return rows
-
-
-def ledger_row(name: str, scale: float, sd_log: float | None, use: str) -> dict[str, Any]:
-    """One estimate of the scale."""
-    return {"name": name, "scale": scale, "sd_log": sd_log, "use": use}
 
 
 def draw_alignment(path: Path, cloud: Cloud, scene: Cloud, scene_from_object: Sim3, seed: int) -> None:

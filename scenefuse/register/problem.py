@@ -185,7 +185,6 @@ def scale_quantities(ledger: list[Estimate], scales: ScaleRange, method: str) ->
         "scale": quantity(scales.centre, "scene units per object unit"),
         "width_log": quantity(scales.width, "1"),
         "method": quantity(method, ""),
-        "spread_log": quantity(float(np.std([np.log(e.scale) for e in ledger])), "1"),
         "ledger": quantity([{"name": e.name, "scale": e.scale, "used": e.used} for e in ledger], ""),
     }
 

@@ -361,7 +361,6 @@ def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, An
         content |= {
             "scene_from_object": quantity(pose.matrix, ""),
             "scale": quantity(pose.scale, unit),
-            "scale_prior": quantity([found.scales.clamp(0.0), found.scales.clamp(np.inf)], unit),
             "margin": quantity(decision.margin, "1"),
             "free_axis": quantity(decision.free_axis, ""),
             **uncertainty_quantities(outcome.stated, found.unit),

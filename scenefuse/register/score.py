@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, sampled, spacing
+from scenefuse.cloud.clouds import Cloud, sampled
 from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.geometry.depth_test import FreeSpace
@@ -220,8 +220,6 @@ def registration_metrics(
         "normal_consistency": quantity(float(facing.mean()) if inlier.any() else None, "1"),
         "normal_consistency_self": quantity(self_consistency(np.concatenate([moved, scene.points])), "1"),
         "tau": quantity(tau, unit),
-        "object_spacing": quantity(spacing(moved), unit),
-        "scene_spacing": quantity(spacing(scene.points), unit),
     }
 
 

@@ -27,7 +27,7 @@ from scenefuse.register.coarse import (
     upright_candidates,
 )
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.fine import register_finely, scale_ledger
+from scenefuse.register.fine import register_finely
 from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.score import color_agreement, score
@@ -422,12 +422,3 @@ def test_free_space_is_read_from_the_depth_maps_of_a_workspace(tmp_path, house):
     assert found.violation(truth.apply(house.object.points)) < 0.05
     assert found.violation(lifted.apply(house.object.points)) > 0.5
     assert read_free_space(tmp_path, (tmp_path / "none",), house.scene.points, 5, 1.0) is None
-
-
-def test_scale_ledger_names_every_estimate_and_the_winner(house, by_clouds):
-    outcome = by_clouds
-    content = {"ledger": quantity([{"name": "rms", "scale": 1.0, "used": False}], "")}
-    alignment = shared(house.scene_from_object)
-    rows = scale_ledger(content, alignment, outcome.ranked[0], outcome.uncertainty, outcome.decision.decided_by)
-    assert [r["name"] for r in rows] == ["rms", "shared points", "clouds"]
-    assert rows[-1]["use"].startswith("taken") and rows[-1]["scale"] == outcome.ranked[0].pose.scale
