@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.formats import columns_in_parts
@@ -155,6 +157,15 @@ def _to_nearest(points: NDArray[np.float64], seed: int = 0) -> NDArray[np.float6
         return np.zeros(0)
     chosen = np.random.default_rng(seed).choice(len(points), min(5000, len(points)), replace=False)
     return np.asarray(cKDTree(points).query(points[chosen], k=2)[0][:, 1])
+
+
+def parts(points: NDArray[np.float64], link: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The connected part of each point, of points closer than about `link`, and how many points each part has."""
+    cells, cell_of = np.unique(np.floor(points / link).astype(np.int64), axis=0, return_inverse=True)
+    touching = cKDTree(cells).query_pairs(1.8, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(touching)), touching.T), shape=(len(cells), len(cells)))
+    part_of = connected_components(graph, directed=False)[1][cell_of.ravel()]
+    return part_of, np.bincount(part_of)
 
 
 def plane_normals(points: NDArray[np.float64], neighbours: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -5,11 +5,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from scenefuse.cloud.clouds import Cloud, spacing
+from scenefuse.cloud.clouds import Cloud, parts, spacing
 from scenefuse.core.stage import setting, threads
 from scenefuse.core.transforms import UP, Array, rotation_between
 from scenefuse.geometry.ground import Ground, fit_ground
@@ -162,15 +160,6 @@ def _parts_near(points: Array, marks: Array, link: float, reach: float) -> NDArr
     part_of, counts = parts(points, link)
     touched = np.bincount(part_of, cKDTree(marks).query(points, workers=threads())[0] <= reach) > 0
     return (touched & (counts >= MIN_PART_SHARE * len(points)))[part_of]
-
-
-def parts(points: Array, link: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The connected part of each point, of points closer than about `link`, and how many points each part has."""
-    cells, cell_of = np.unique(np.floor(points / link).astype(np.int64), axis=0, return_inverse=True)
-    touching = cKDTree(cells).query_pairs(1.8, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(touching)), touching.T), shape=(len(cells), len(cells)))
-    part_of = connected_components(graph, directed=False)[1][cell_of.ravel()]
-    return part_of, np.bincount(part_of)
 
 
 def ground_under(points: Array, marks: Array, low: Array, high: Array) -> tuple[Ground | None, list[str]]:

@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, plane_normals, sampled, spacing
+from scenefuse.cloud.clouds import Cloud, parts, plane_normals, sampled, spacing
 from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
@@ -273,8 +271,9 @@ def _best_primitive(
     for k in np.argsort(-counts, kind="stable")[:5]:
         if counts[k] <= len(best):
             break
-        found = _largest_part(points, np.flatnonzero(inliers[k]), link)
-        best = found if len(found) > len(best) else best
+        on_it = np.flatnonzero(inliers[k])
+        part_of, sizes = parts(points[on_it], link)
+        best = on_it[part_of == sizes.argmax()] if sizes.max() > len(best) else best
     return best
 
 
@@ -325,15 +324,3 @@ def _on_cylinders(points: Array, normals: Array, pairs: Pairs, tolerance: float,
     away = np.linalg.norm(offset, axis=2)
     facing = np.abs((offset * normals).sum(2)) >= cosine * away
     return fine[:, None] & (np.abs(away - radius[:, None]) <= tolerance) & facing
-
-
-def _largest_part(points: Array, index: NDArray[np.int64], link: float) -> NDArray[np.int64]:
-    """The largest set of the indexed points whose cells of edge `link` touch."""
-    if len(index) == 0:
-        return index
-    cells, cell_of = np.unique(np.floor(points[index] / link).astype(np.int64), axis=0, return_inverse=True)
-    cell_of = cell_of.ravel()
-    touching = cKDTree(cells).query_pairs(1.8, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(touching)), touching.T), shape=(len(cells), len(cells)))
-    part = connected_components(graph, directed=False)[1][cell_of]
-    return index[part == np.bincount(part).argmax()]

@@ -23,7 +23,7 @@ from scenefuse.geometry.consistency import compare, extent, normals_from_depth, 
 from scenefuse.geometry.depth_test import DEPTH_JUMP
 from scenefuse.geometry.photo_check import MIN_AGREEING
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
-from scenefuse.nerf.appearance import MIN_OPACITY, falloff_map, fitted_log_gain, gains_nearby
+from scenefuse.nerf.appearance import MIN_OPACITY, blurred, falloff_map, fitted_log_gain, gains_nearby
 from scenefuse.nerf.rays import SURFACE_DEPTH, PhotoTensors, dilate
 from scenefuse.nerf.render import RenderedView, render_view
 from scenefuse.nerf.training import Nerf
@@ -343,20 +343,11 @@ def psnr(a: Tensor, b: Tensor, where: Tensor) -> float:
 
 def ssim(a: Tensor, b: Tensor, where: Tensor) -> float:
     """Structural similarity (Wang et al. 2004) of (H, W, 3) pictures in 0..1; Gaussian window, sigma 1.5 pixels."""
-    x = torch.arange(11.0) - 5
-    line = torch.exp(-(x**2) / (2 * 1.5**2))
-    line = line / line.sum()
-
-    def blur(picture: Tensor) -> Tensor:
-        rows = torch.nn.functional.conv2d(picture, line.view(1, 1, 11, 1), padding=(5, 0))
-        return torch.nn.functional.conv2d(rows, line.view(1, 1, 1, 11), padding=(0, 5))
-
-    p, q = (c.permute(2, 0, 1)[:, None].float() for c in (a, b))
-    mp, mq = blur(p), blur(q)
-    vp, vq, covariance = blur(p * p) - mp * mp, blur(q * q) - mq * mq, blur(p * q) - mp * mq
+    mean_a, mean_b, aa, bb, ab = (blurred(picture, 1.5) for picture in (a, b, a * a, b * b, a * b))
     c1, c2 = 0.01**2, 0.03**2
-    score = (2 * mp * mq + c1) * (2 * covariance + c2) / ((mp * mp + mq * mq + c1) * (vp + vq + c2))
-    return float(score[:, 0].mean(0)[where].mean())
+    covariance, spread = ab - mean_a * mean_b, (aa - mean_a**2) + (bb - mean_b**2)
+    score = (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (spread + c2))
+    return float(score.mean(2)[where].mean())
 
 
 def silhouette_iou(opacity: Tensor, mask: Tensor) -> float:

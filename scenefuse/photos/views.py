@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
-from scenefuse.photos.pictures import read_gray
-from scenefuse.photos.workspace import View, read_workspace
+from scenefuse.photos.workspace import View, read_workspace, with_mask
 
 Pixel = TypeVar("Pixel", bound=np.generic)
 
@@ -94,7 +93,7 @@ def load_views(workspace: Path, masks: Path, width_px: int, hold_out_every: int)
         )
     factors = scales(read.views, width_px)
     photos = [_scaled(read.rgb(view), scale) for view, scale in zip(read.views, factors)]
-    mattes = [_scaled(_matte(file, view), scale) for file, view, scale in zip(files, read.views, factors)]
+    mattes = [_scaled(with_mask(view, file), scale) for file, view, scale in zip(files, read.views, factors)]
     shape = max(view.height for view in photos), max(view.width for view in photos)
     return Views(
         [view.name for view in photos],
@@ -131,14 +130,6 @@ def scales(views: list[View], width_px: int) -> list[float]:
 def _scaled(view: View, scale: float) -> View:
     """The view, larger or smaller."""
     return view.resized(round(view.width * scale), round(view.height * scale))
-
-
-def _matte(path: Path, view: View) -> View:
-    """The view with its mask's grey values, (H, W) uint8, as pixels."""
-    matte = read_gray(path)
-    if matte.shape != (view.height, view.width):
-        raise StageError(f"{path} and the photo {view.name} differ in size; rerun the masks stage")
-    return replace(view, pixels=matte)
 
 
 def _held_out(workspace: Path, names: list[str], hold_out_every: int) -> NDArray[np.bool_]:

@@ -123,19 +123,13 @@ class Workspace:
 
     def rgb(self, view: View) -> View:
         """A view with its photo, (H, W, 3) uint8 RGB."""
-        return self._with(view, read_rgb(self.folder / "images" / view.name))
+        path = self.folder / "images" / view.name
+        return _with_pixels(view, path, read_rgb(path), "undistortion")
 
     def gray(self, view: View) -> View:
         """A view with its photo, (H, W) uint8."""
-        return self._with(view, read_gray(self.folder / "images" / view.name))
-
-    def _with(self, view: View, pixels: NDArray[np.uint8]) -> View:
-        if pixels.shape[:2] != (view.height, view.width):
-            raise StageError(
-                f"{self.folder}/images/{view.name} is {pixels.shape[1]} x {pixels.shape[0]} pixels, but its camera"
-                f" is made for {view.width} x {view.height}; rerun the undistortion"
-            )
-        return replace(view, pixels=pixels)
+        path = self.folder / "images" / view.name
+        return _with_pixels(view, path, read_gray(path), "undistortion")
 
 
 def with_mask(view: View, path: Path) -> View:
@@ -144,13 +138,18 @@ def with_mask(view: View, path: Path) -> View:
     Raises:
         StageError: the mask is missing, no picture, or not of its photo's size.
     """
-    mask = read_gray(path)
-    if mask.shape != (view.height, view.width):
+    return _with_pixels(view, path, read_gray(path), "masks")
+
+
+def _with_pixels(view: View, path: Path, pixels: NDArray[np.uint8], stage: str) -> View:
+    """A view with the pixels of a file that a stage made."""
+    height, width = pixels.shape[:2]
+    if (height, width) != (view.height, view.width):
         raise StageError(
-            f"{path} is {mask.shape[1]} x {mask.shape[0]} pixels, but its photo {view.width} x {view.height}; rerun the"
-            " masks"
+            f"{path} is {width} x {height} pixels, but its camera is made for {view.width} x {view.height}; rerun the"
+            f" {stage}"
         )
-    return replace(view, pixels=mask)
+    return replace(view, pixels=pixels)
 
 
 def read_workspace(folder: Path) -> Workspace:

@@ -11,7 +11,7 @@ from scenefuse.core.transforms import Array
 from scenefuse.marks.clicks import Click, Clicks
 from scenefuse.marks.triangulation import triangulate_consistent
 from scenefuse.photos.workspace import posed_images, ray_through, read_model
-from scenefuse.pick.edits import Sizes
+from scenefuse.pick.document import Sizes
 
 # A ray reaches so many times nearer and farther than the sparse points that the photo sees.
 RAY_REACH = 4

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from nicegui import ui
 
 from scenefuse.marks.clicks import label_name
-from scenefuse.pick.edits import Rows
+from scenefuse.pick.document import Rows
 from scenefuse.pick.photo_map import MaskLayers
 from scenefuse.pick.photo_tiles import Picture
 from scenefuse.pick.session import Session, next_command

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.marks.clicks import Click
-from scenefuse.pick.edits import Corners, Rows
+from scenefuse.pick.document import Corners, Rows
 from scenefuse.pick.photo_tiles import Picture
 from scenefuse.pick.session import Session
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError, scratch_directory, threads
 from scenefuse.core.transforms import Array
 from scenefuse.masks.prompts import OUTLINE_BAND_SHARE, pixel_of
-from scenefuse.pick.edits import Rows
+from scenefuse.pick.document import Rows
 from scenefuse.pick.photo_tiles import MASK_PX, Picture, at_most, read_upright
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from scenefuse.crop.marked import MIN_INSIDE
 from scenefuse.marks.clicks import Kind
 from scenefuse.photos.photo_files import frame_name, thin_out, upright_size
 from scenefuse.photos.photos import photo_names, without_copies
-from scenefuse.pick.document import Document
-from scenefuse.pick.edits import (
+from scenefuse.pick.document import (
     Corners,
+    Document,
     Rows,
     Sizes,
     point_name,

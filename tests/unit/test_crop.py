@@ -385,5 +385,5 @@ def test_a_mask_of_another_size_is_one_sentence(orbit, tmp_path):
     folder, _ = orbit
     shutil.copytree(folder / "masks", tmp_path / "masks")
     cv2.imwrite(str(tmp_path / "masks/3.png"), np.full((120, 160), 255, np.uint8))
-    with pytest.raises(StageError, match="3.png is 160 x 120 pixels, but its photo 320 x 240"):
+    with pytest.raises(StageError, match="3.png is 160 x 120 pixels, but its camera is made for 320 x 240"):
         read_masked_views(folder / "undistorted", tmp_path / "masks", 0.8)

@@ -225,7 +225,7 @@ def test_of_an_unregistered_object_the_stage_writes_the_reason(files):
 def test_a_mask_of_another_size_is_one_sentence(files):
     inputs, outputs = files
     cv2.imwrite(str(inputs.masks / "3.png"), np.zeros((50, 60), np.uint8))
-    with pytest.raises(StageError, match="3.png is 60 x 50 pixels, but its photo 200 x 200"):
+    with pytest.raises(StageError, match="3.png is 60 x 50 pixels, but its camera is made for 200 x 200"):
         find_missing(inputs=inputs, outputs=outputs)
     assert not outputs.missing.exists()
 

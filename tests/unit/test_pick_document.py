@@ -7,8 +7,7 @@ import pytest
 from scenefuse.core.stage import StageError
 from scenefuse.marks.clicks import Click, read_points
 from scenefuse.marks.triangulation import read_ends
-from scenefuse.pick.document import Document
-from scenefuse.pick.edits import with_length, with_point
+from scenefuse.pick.document import Document, with_length, with_point
 
 HEAD, FOOT = Click("inside", "Füße 2.jpg", 10.5, 20), Click("outside", "a b.jpg", 3, 4)
 TEXT = "label\tphoto\tx_px\ty_px\n"

@@ -4,7 +4,7 @@ import pytest
 
 from scenefuse.core.stage import StageError
 from scenefuse.marks.clicks import Click, label_name
-from scenefuse.pick.edits import (
+from scenefuse.pick.document import (
     point_name,
     problems,
     with_box,
