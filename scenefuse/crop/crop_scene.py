@@ -311,7 +311,6 @@ def _report(scene_points: int, part: Cloud, cut: Crop, unit: str) -> dict[str, o
     """The stage JSON of a crop."""
     return {
         "shape": quantity(cut.shape, ""),
-        "up_in_scene": quantity(UP, ""),
         "level_from_scene": quantity(cut.level_from_scene, ""),
         "box_low": quantity(cut.low, unit),
         "box_high": quantity(cut.high, unit),

@@ -9,7 +9,7 @@ import numpy as np
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
-from scenefuse.core.transforms import Array, Sim3, rotation_between
+from scenefuse.core.transforms import Array, Sim3
 from scenefuse.fuse.write import Source
 from scenefuse.metrics.completion import MetricSettings, completion_metrics, completion_of, variation_radius
 from scenefuse.register.score import registration_metrics
@@ -47,7 +47,7 @@ def compute_metrics(
     tau = settings.agreement.tau_fraction * diagonal
     found = registration_metrics(obj, scene, pose, tau, diagonal, unit)
     found["status"] = quantity(value(registration, "status"), "")
-    size = box_size(pose.apply(obj.points), np.array(crop_about.get("up_in_scene", {}).get("value", [0.0, 0.0, 1.0])))
+    size = box_size(pose.apply(obj.points))
     content: dict[str, Any] = {"registration": found, "object": {"size": quantity(size, unit)}}
     if fused is not None:
         after = read_cloud(fused)
@@ -91,16 +91,10 @@ def compute_scene_metrics(
     _write(report, {"completion": found})
 
 
-def box_size(points: Array, up: Array) -> list[float]:
-    """Length, width and height of points (N, 3): of the smallest box that stands upright around nearly all of them.
-
-    Args:
-        points: in the scene's frame.
-        up: (3,) direction opposite to gravity.
-    """
-    level = points @ rotation_between(up, np.array([0.0, 0.0, 1.0])).T
-    low, high = np.percentile(level, [0.5, 99.5], axis=0)
-    inside = level[((level >= low) & (level <= high)).all(1)]
+def box_size(points: Array) -> list[float]:
+    """Length, width and height of points (N, 3), z up: of the smallest upright box around nearly all of them."""
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    inside = points[((points >= low) & (points <= high)).all(1)]
     ground_plan = cv2.minAreaRect((inside[:, :2] - low[:2]).astype(np.float32))[1]
     return [*sorted(map(float, ground_plan), reverse=True), float(high[2] - low[2])]
 

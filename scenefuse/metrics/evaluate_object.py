@@ -13,30 +13,7 @@ from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
 from scenefuse.fuse.write import after_fusion
 from scenefuse.geometry.visual_hull import mask_iou
-from scenefuse.metrics.truth import (
-    HIDDEN,
-    SAMPLES,
-    THRESHOLDS,
-    CameraFit,
-    Cameras,
-    Mesh,
-    Posed,
-    belongs_to_object,
-    camera_results,
-    cast_together,
-    distances,
-    fit_cameras,
-    nearest,
-    print_results,
-    read_mesh,
-    read_posed,
-    registration_error,
-    sample_surface,
-    scores_at,
-    true_depth,
-    visible,
-)
-from scenefuse.metrics.truth import read_cameras as read_true_cameras
+from scenefuse.metrics import truth
 from scenefuse.photos.pictures import read_depth, read_gray
 from scenefuse.photos.workspace import read_cameras, read_views
 from scenefuse.sfm.undistort import undistort_picture
@@ -67,29 +44,29 @@ class ObjectTruth:
 
     diagonal: float
     middle: Array
-    mesh: Mesh
-    rest: Mesh
+    mesh: truth.Mesh
+    rest: truth.Mesh
     everything: Any
-    orbit: Cameras
-    posed: Posed
-    fit: CameraFit
+    orbit: truth.Cameras
+    posed: truth.Posed
+    fit: truth.CameraFit
     surface: Array
     seen: NDArray[np.bool_]
 
 
 def read_object_truth(workspace: Path, truth_scene: Path, truth_object: Path, samples: int, seed: int) -> ObjectTruth:
     """The truth of an object and the poses of its model in it; arguments and errors as in `evaluate_object`."""
-    orbit = read_true_cameras(truth_object / "cameras.json")
+    orbit = truth.read_cameras(truth_object / "cameras.json")
     extent = read_json(truth_object / "cameras.json")["object"]
-    mesh, rest = read_mesh(truth_object / "mesh.ply"), read_mesh(truth_scene / "meshes" / "world.ply")
+    mesh, rest = truth.read_mesh(truth_object / "mesh.ply"), truth.read_mesh(truth_scene / "meshes" / "world.ply")
     others = [
-        read_mesh(path)
+        truth.read_mesh(path)
         for path in sorted((truth_scene / "meshes").glob("*.ply"))
         if path.stem not in ("world", truth_object.name)
     ]
-    everything = cast_together([mesh, rest, *others])
-    posed = read_posed(workspace / "sparse", orbit)
-    surface = sample_surface(mesh, samples, seed)
+    everything = truth.cast_together([mesh, rest, *others])
+    posed = truth.read_posed(workspace / "sparse", orbit)
+    surface = truth.sample_surface(mesh, samples, seed)
     return ObjectTruth(
         float(value(extent, "diagonal")),
         np.array(value(extent, "middle")),
@@ -98,9 +75,9 @@ def read_object_truth(workspace: Path, truth_scene: Path, truth_object: Path, sa
         everything,
         orbit,
         posed,
-        fit_cameras(posed, orbit),
+        truth.fit_cameras(posed, orbit),
         surface,
-        np.asarray(visible(everything, orbit, surface, HIDDEN)[1].any(0)),
+        np.asarray(truth.visible(everything, orbit, surface, truth.HIDDEN)[1].any(0)),
     )
 
 
@@ -117,7 +94,7 @@ def depth_results(stages: list[Path], known: ObjectTruth, max_photos: int = COMP
                 continue
             depth = read_depth(path)
             size = depth.shape[1], depth.shape[0]
-            true, hit = true_depth(known.everything, view, truth_from_object, size)
+            true, hit = truth.true_depth(known.everything, view, truth_from_object, size)
             on_object = hit == 0
             pixels += int(on_object.sum())
             valid = on_object & (depth > 0)
@@ -132,13 +109,13 @@ def depth_results(stages: list[Path], known: ObjectTruth, max_photos: int = COMP
 
 def cloud_results(points: Array, known: ObjectTruth, samples: int, seed: int) -> dict[str, Any]:
     """Accuracy, F-scores, precision and recall of the object's cloud (N, 3), in the truth's frame."""
-    to_mesh = distances(known.mesh.caster(), sampled(points, samples, seed)) / known.diagonal
-    to_cloud = nearest(known.surface[known.seen], points) / known.diagonal
+    to_mesh = truth.distances(known.mesh.caster(), sampled(points, samples, seed)) / known.diagonal
+    to_cloud = truth.nearest(known.surface[known.seen], points) / known.diagonal
     result = {
         "cloud_accuracy_median": quantity(100 * float(np.median(to_mesh)), "% of the diagonal"),
         "cloud_accuracy_90": quantity(100 * float(np.quantile(to_mesh, 0.9)), "% of the diagonal"),
     }
-    for ending, scores in scores_at(to_mesh, to_cloud, 1.0).items():
+    for ending, scores in truth.scores_at(to_mesh, to_cloud, 1.0).items():
         result |= {f"cloud_{name}_{ending}": quantity(score, "1") for name, score in scores.items()}
     return result
 
@@ -152,8 +129,8 @@ def around_object(points: Array, known: ObjectTruth) -> NDArray[np.bool_]:
     near = ((points >= low - margin) & (points <= high + margin)).all(1)
     inside = np.flatnonzero(near)
     if len(inside):
-        own, other = (distances(mesh.caster(), points[inside]) for mesh in (known.mesh, known.rest))
-        near[inside] = belongs_to_object(points[inside], own, other, low, high, margin)
+        own, other = (truth.distances(mesh.caster(), points[inside]) for mesh in (known.mesh, known.rest))
+        near[inside] = truth.belongs_to_object(points[inside], own, other, low, high, margin)
     return near
 
 
@@ -166,13 +143,13 @@ def scene_scores(points: Array, known: ObjectTruth, surface: Array) -> dict[str,
         surface: (M, 3) what is to be found of the object's surface.
     """
     points = points[around_object(points, known)]
-    to_mesh = distances(known.mesh.caster(), points) if len(points) else np.empty(0, dtype=np.float32)
-    return scores_at(to_mesh, nearest(surface, points), known.diagonal)
+    to_mesh = truth.distances(known.mesh.caster(), points) if len(points) else np.empty(0, dtype=np.float32)
+    return truth.scores_at(to_mesh, truth.nearest(surface, points), known.diagonal)
 
 
-def surface_to_find(known: ObjectTruth, flight: Cameras) -> Array:
+def surface_to_find(known: ObjectTruth, flight: truth.Cameras) -> Array:
     """(M, 3) what of the object's true surface any photo of its orbit or of the flight sees, in the truth's frame."""
-    return known.surface[known.seen | visible(known.everything, flight, known.surface, HIDDEN)[1].any(0)]
+    return known.surface[known.seen | truth.visible(known.everything, flight, known.surface, truth.HIDDEN)[1].any(0)]
 
 
 @dataclass(frozen=True)
@@ -209,7 +186,7 @@ class EvaluationInputs:
     """What fusion changed in the scene; as `fused`."""
 
 
-def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, samples: int = SAMPLES) -> None:
+def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, samples: int = truth.SAMPLES) -> None:
     """Compare an object with its truth: masks, cameras, depth after each stage, cloud, registration, completed scene.
 
     Definitions (method G8). Every length is over the diagonal of the object's true bounding box; F-score, precision and
@@ -235,7 +212,7 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, sample
     result: dict[str, Any] = {
         "diagonal": quantity(known.diagonal, "m"),
         **({} if inputs.masks is None else _mask_results(inputs, inputs.masks)),
-        **camera_results(known.fit, len(known.orbit.names)),
+        **truth.camera_results(known.fit, len(known.orbit.names)),
         **depth_results(list(inputs.stages), known),
         **cloud_results(known.fit.truth_from_model.apply(points), known, samples, seed),
     }
@@ -248,14 +225,14 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, sample
     if inputs.alignment_json is not None:
         errors = errors_of(inputs.alignment_json)
         result |= {f"alignment_{name}": entry for name, entry in errors.items() if name != "status"}
-    flight = read_true_cameras(inputs.truth_scene / "cameras.json")
+    flight = truth.read_cameras(inputs.truth_scene / "cameras.json")
     surface = surface_to_find(known, flight)
     for when, cloud in _around_object(inputs, known, truth_from_scene).items():
         for ending, scores in scene_scores(truth_from_scene.apply(cloud.points), known, surface).items():
             result |= {f"scene_{name}_{when}_{ending}": quantity(score, "1") for name, score in scores.items()}
     result["variants"] = variants
     write_json(report, result)
-    print_results(result)
+    truth.print_results(result)
 
 
 def _around_object(inputs: EvaluationInputs, known: ObjectTruth, truth_from_scene: Sim3) -> dict[str, Cloud]:
@@ -295,14 +272,16 @@ def _registration_results(
     result = {"status": quantity(fine.get("status", {}).get("value"), "")}
     if matrix is None:
         errors = ("scale_error_pct", "rotation_error_deg", "translation_error_over_diagonal")
-        return result | {key: quantity(None, "") for key in (*errors, *(f"placed_f_score_{e}" for e in THRESHOLDS))}
+        return result | {
+            key: quantity(None, "") for key in (*errors, *(f"placed_f_score_{e}" for e in truth.THRESHOLDS))
+        }
     estimated, truth_from_object = Sim3.from_matrix(np.array(matrix)), known.fit.truth_from_model
     true = truth_from_scene.inverse() @ truth_from_object
     middle = truth_from_object.inverse().apply(known.middle)
-    error = registration_error(estimated, true, middle, known.diagonal / truth_from_scene.scale)
+    error = truth.registration_error(estimated, true, middle, known.diagonal / truth_from_scene.scale)
     placed = (truth_from_scene @ estimated).apply(points)
-    to_mesh = distances(known.mesh.caster(), sampled(placed, samples, seed))
-    scores = scores_at(to_mesh, nearest(known.surface[known.seen], placed), known.diagonal)
+    to_mesh = truth.distances(known.mesh.caster(), sampled(placed, samples, seed))
+    scores = truth.scores_at(to_mesh, truth.nearest(known.surface[known.seen], placed), known.diagonal)
     return result | {
         "scale_error_pct": quantity(error.scale_pct, "%"),
         "rotation_error_deg": quantity(error.rotation_deg, "deg"),

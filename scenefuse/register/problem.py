@@ -30,7 +30,7 @@ class Inputs:
     crop: Path
     """Scene crop (PLY) in the scene frame."""
     crop_json: Path
-    """JSON of the crop stage, for `up_in_scene`, what says so, and the unit of lengths."""
+    """JSON of the crop stage, for what says that z is up in the scene, and for the unit of lengths."""
     workspace_json: Path | None = None
     """JSON with `up_in_camera_frame`, the up direction in the object's frame; without it, or without the key, gravity
     is not used."""
@@ -52,11 +52,8 @@ class Inputs:
         of_scene = read_json(self.crop_json)
         if any(content.get("up_cue", {}).get("value") in UNSURE_CUES for content in (of_object, of_scene)):
             return None
-        up_in_object, up_in_scene = of_object.get("up_in_camera_frame"), of_scene.get("up_in_scene")
-        if not up_in_object or not up_in_scene or up_in_object["value"] is None or up_in_scene["value"] is None:
-            return None
-        a, b = np.array(up_in_object["value"], float), np.array(up_in_scene["value"], float)
-        return a / np.linalg.norm(a), b / np.linalg.norm(b)
+        up = of_object.get("up_in_camera_frame", {}).get("value")
+        return None if up is None else (np.array(up, float) / np.linalg.norm(up), UP)
 
     def length_unit(self) -> str:
         """The unit of the scene's lengths."""

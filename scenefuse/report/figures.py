@@ -1,4 +1,4 @@
-"""The figures of an object: what was missing, what was added, how it fits (paper Figures 2, 3, 5)."""
+"""The figures of an object: what was missing, what was added (paper Figures 2 and 3)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import StageError, atomic_directory, read_json, value
-from scenefuse.core.transforms import UP, Array, Sim3, box_around, rotation_between
+from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.fuse.fuse_object import is_placed
 from scenefuse.fuse.missing import Lack
 from scenefuse.fuse.write import after_fusion
@@ -26,7 +26,7 @@ from scenefuse.report.values import load, unit_of
 from scenefuse.report.view import REACH, view_of, within, write_view
 from scenefuse.sfm.gravity import estimate_up
 
-SCENE, CROP, OBJECT = "#cdd0d4", "#285fb9", "#f5aa55"
+SCENE = "#cdd0d4"
 LACKS = {Lack.NEVER_SEEN: "#d6261f", Lack.UNTEXTURED: "#3465c4", Lack.CONTRADICTED: "#963caa"}
 # Azimuths of the four sides that a row of pictures shows.
 SIDES_DEG = (30.0, 120.0, 210.0, 300.0)
@@ -36,12 +36,11 @@ Discs = list[tuple[Cloud, NDArray[np.float32]]]
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The clouds of one object in the scene's frame, turned so that z points up.
+    """The clouds of one object in the scene's frame.
 
     Attributes:
         before: the scene around the object.
         after: the same part of the scene after fusion.
-        crop: the object's part of the scene, as registration saw it.
         object_cloud: the object at its estimated pose, or None when there is no pose.
         framed: (N, 3) points every picture has to show.
         fused: whether the object was fused.
@@ -53,7 +52,6 @@ class Surroundings:
 
     before: Cloud
     after: Cloud
-    crop: Cloud
     object_cloud: Cloud | None
     framed: Array
     fused: bool
@@ -78,7 +76,7 @@ class FigureInputs:
     crop: Path
     """The object's part of the scene, scene frame."""
     crop_json: Path
-    """JSON of the crop; `up_in_scene` is the direction opposite to gravity, z when absent."""
+    """JSON of the crop, for the unit of lengths."""
     object_cloud: Path
     """The object's cloud in its own frame."""
     fine_json: Path
@@ -98,13 +96,12 @@ class FigureInputs:
 
 
 def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
-    """Draw the figures of one object (paper Figures 2, 3 and 5).
+    """Draw the figures of one object (paper Figures 2 and 3).
 
     Writes before_after.png (the surroundings before and after fusion from four sides and from below), before.png and
     after.png (one large view of each, the side that changed most), missing.png (what is still missing, and from where
-    photos would show it), registration.png (object over crop, with the decision) and object.png (frames, masks, depth
-    of the four stages, renders, the object's cloud, alone where it was given); of a fused object view.ply and view.json
-    too, for the 3D view of the report page.
+    photos would show it) and object.png (frames, masks, depth of the four stages, renders, the object's cloud, alone
+    where it was given); of a fused object view.ply and view.json too, for the 3D view of the report page.
 
     Args:
         inputs: see FigureInputs.
@@ -121,7 +118,6 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
     large = _large(clouds, join.framed, azimuth_deg, (2 * TILE_PX[0], 2 * TILE_PX[1]))
     pictures: dict[str, Image | Figure] = dict(zip(("before", "after"), large))
     pictures["before_after"] = _before_after(inputs.name, join, clouds)
-    pictures["registration"] = _registration(inputs.name, join)
     if join.fused and join.missing is not None:
         pictures["missing"] = _missing(inputs.name, join, join.missing, clouds[1][1])
     cloud = join.object_cloud or read_cloud(inputs.object_cloud)
@@ -212,27 +208,6 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
             str(number), middle, place, arrowprops=arrow, bbox=mark, color="white", ha="center", va="center"
         )  # fmt: skip
     return sheet
-
-
-def _registration(name: str, join: Surroundings) -> Figure:
-    """The object over the crop from three sides."""
-    dots = point_radii(join.crop.points)
-    radii = 0.5 * np.minimum(dots, np.float32(np.median(dots)))
-    colors, framed = np.tile(_rgb(CROP), (len(join.crop), 1)), join.crop.points
-    if join.object_cloud is not None:
-        framed = np.concatenate([framed, join.object_cloud.points])
-        radii = np.concatenate([radii, point_radii(join.object_cloud.points)])
-        colors = np.concatenate([colors, np.tile(_rgb(OBJECT), (len(join.object_cloud), 1))])
-    # Small dots of the crop over the closed surface of the object; without normals both are shaded by depth alone.
-    cloud = Cloud(framed)
-    views = {"side, azimuth 30°": (30.0, 12.0), "side, azimuth 120°": (120.0, 12.0), "from above": (-90.0, 90.0)}
-    cells = [
-        (label, render(cloud, orbit_camera(framed, *angles, TILE_PX, orthographic=True), radii, colors))
-        for label, angles in views.items()
-    ]
-    no_pose = " (no pose)" if join.object_cloud is None else ""
-    note = f"{join.decision}. Blue: crop of the scene, orange: object{no_pose}"
-    return draw_sheet(f"{name}: registration", note, [cells])
 
 
 def _large(clouds: Discs, framed: Array, azimuth_deg: float, size_px: tuple[int, int]) -> list[Image]:
@@ -340,25 +315,21 @@ def inner(points: Array, limit: int = 20000) -> Array:
 
 
 def read_surroundings(inputs: FigureInputs) -> Surroundings:
-    """Read the clouds and turn them upright; the surroundings are cut to a box around the object.
+    """Read the clouds; the surroundings are cut to a box around the object.
 
     Raises:
         StageError: a file is missing or damaged, or the scene has no points around the object.
     """
     fine = read_json(inputs.fine_json)
-    up = read_json(inputs.crop_json).get("up_in_scene", {}).get("value")
-    level = Sim3(1.0, rotation_between(np.array(up or UP), UP), np.zeros(3))
-    crop = read_cloud(inputs.crop).transformed(level)
     pose, fused, placed = fine.get("scene_from_object", {}).get("value"), is_placed(fine), None
     if pose is not None:
-        placed = read_cloud(inputs.object_cloud).transformed(level @ Sim3.from_matrix(np.array(pose)))
-    shown = placed if fused and placed is not None else crop
-    low, high = np.percentile(shown.points, [0.5, 99.5], axis=0)
+        placed = read_cloud(inputs.object_cloud).transformed(Sim3.from_matrix(np.array(pose)))
+    shown = (placed if fused and placed is not None else read_cloud(inputs.crop)).points
+    low, high = np.percentile(shown, [0.5, 99.5], axis=0)
     reach = REACH * float(np.linalg.norm(high - low))
-    scene, box = open_cloud(inputs.scene), box_around(low - reach, high + reach, level.inverse())
+    scene, box = open_cloud(inputs.scene), (low - reach, high + reach)
     clouds = scene.near(*box)[1], after_fusion(scene, inputs.checked, inputs.fused, *box)
-    level_clouds = (cloud.transformed(level) for cloud in clouds)
-    before, after = (cloud[within(cloud.points, low, high, REACH)] for cloud in level_clouds)
+    before, after = (cloud[within(cloud.points, low, high, REACH)] for cloud in clouds)
     if not len(before):
         raise StageError(
             f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"
@@ -367,10 +338,8 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
     decision = ": ".join(filter(None, [value(fine, "status"), fine.get("reason", {}).get("value")]))
     missing = None
     if (share := read_json(inputs.missing_json).get("missing", {}).get("value")) is not None:
-        missing = (read_cloud(inputs.missing) if share else Cloud(np.zeros((0, 3)))).transformed(level)
+        missing = read_cloud(inputs.missing) if share else Cloud(np.zeros((0, 3)))
     photos = pd.read_csv(inputs.next_photos)
     # The middle one of the three photos of a station.
-    stations = level.apply(photos[photos.photo == 2][["x", "y", "z"]].to_numpy(np.float64))
-    return Surroundings(
-        before, after, crop, placed, inner(shown.points), fused, decision, unit, missing, stations
-    )  # fmt: skip
+    stations = photos[photos.photo == 2][["x", "y", "z"]].to_numpy(np.float64)
+    return Surroundings(before, after, placed, inner(shown), fused, decision, unit, missing, stations)

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.cloud.tiled_cloud import morton
-from scenefuse.core.stage import read_json, threads
-from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
+from scenefuse.core.stage import threads
+from scenefuse.core.transforms import Array
 from scenefuse.photos.sheets import TILE_PX
 from scenefuse.report.facts import has_surface
 from scenefuse.report.view import Bytes, color_planes, difference_planes, log_levels
@@ -24,7 +24,7 @@ from scenefuse.surface.texture import simplified
 
 @dataclass(frozen=True)
 class ViewMesh:
-    """A mesh in the frame of a view.
+    """A mesh in the scene's frame.
 
     Attributes:
         vertices: V of them, with the fields `class` and `deviation`, and colours where there is no picture.
@@ -32,7 +32,6 @@ class ViewMesh:
         uv: (V, 2) places in the picture, from its upper left, 0..1; None without a picture.
         picture: of the photos, small enough for a page.
         all_faces: how many the surface has of which this is a simplification.
-        scene_from_view: (4, 4), to the scene's frame.
     """
 
     vertices: Cloud
@@ -40,11 +39,10 @@ class ViewMesh:
     uv: Array | None
     picture: Image.Image | None
     all_faces: int
-    scene_from_view: Array
 
 
 def read_mesh(folder: Path, unit: str) -> ViewMesh | None:
-    """The surface in an object's results, simplified and turned as its view is; None where there is none.
+    """The surface in an object's results, simplified; None where there is none.
 
     Args:
         folder: results of the object.
@@ -53,30 +51,26 @@ def read_mesh(folder: Path, unit: str) -> ViewMesh | None:
     whole = read_surface(folder / "surface.ply") if has_surface(folder) else None
     if whole is None or not len(whole.faces):
         return None
-    up = read_json(folder / "registration/full/crop.json").get("up_in_scene", {}).get("value")
-    level = Sim3(1.0, rotation_between(np.array(up or UP), UP), np.zeros(3))
     painted = read_painted(folder / "surface.glb")
     if painted is None:
         small = simplified(whole)
-        vertices = small.vertices.transformed(level)
-        return ViewMesh(vertices, small.faces, None, None, len(whole.faces), level.inverse().matrix)
+        return ViewMesh(small.vertices, small.faces, None, None, len(whole.faces))
     points = painted.points / metres_per_unit(unit)
     nearest = cKDTree(whole.vertices.points).query(points, workers=threads())[1]
     fields = {"class": np.zeros(len(points), np.uint8), "deviation": whole.vertices.fields["deviation"][nearest]}
     # A vertex of the GLB has faces of one class only.
     fields["class"][painted.faces] = painted.classes[:, None]
-    vertices = Cloud(level.apply(points), fields=fields)
     picture = Image.fromarray(painted.picture)
     # As large as the widest pictures of the page.
     picture.thumbnail((3 * TILE_PX[0], 3 * TILE_PX[0]))
-    return ViewMesh(vertices, painted.faces, painted.uv, picture, len(whole.faces), level.inverse().matrix)
+    return ViewMesh(Cloud(points, fields=fields), painted.faces, painted.uv, picture, len(whole.faces))
 
 
 def encode_mesh(mesh: ViewMesh, middle: Array, deviations: list[float] | None) -> tuple[dict[str, Any], bytes]:
     """A mesh as what the page's script reads, as `encode` does with points.
 
     Args:
-        mesh: in the view's frame.
+        mesh: to encode.
         middle: (3,) what the page's positions are relative to.
         deviations: ends of the scale of standard deviations; None where they are not shown.
 
@@ -103,7 +97,7 @@ def encode_mesh(mesh: ViewMesh, middle: Array, deviations: list[float] | None) -
         "vertices": len(vertices),
         "faces": len(mesh.faces),
         "all_faces": mesh.all_faces,
-        "scene_from_view": (mesh.scene_from_view @ Sim3(1.0, np.eye(3), middle).matrix)[:3].tolist(),
+        "middle": middle.tolist(),
         "step": step.tolist(),
         "corner": (low - middle).tolist(),
         "planes": list(planes),

@@ -151,7 +151,7 @@ def _scene_card(folder: Path, view: View | None, texts: Texts) -> str:
 
 def _object_record(folder: Path, texts: Texts) -> str:
     """The figures of an object that say how its result came about."""
-    figures = {folder / f"figures/{name}.png": caption for name, caption in texts["object_figures"].items()}
+    figures = {folder / name: caption for name, caption in texts["object_figures"].items()}
     shown = "".join(figure(path, caption) for path, caption in figures.items() if path.is_file())
     return _folded(f"Figures of {folder.name}", shown, f"{folder.name}-record") if shown else ""
 

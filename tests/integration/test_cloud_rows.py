@@ -80,7 +80,7 @@ def test_what_was_not_made_is_said_in_words(project):
     page = (results / "summary/report.html").read_text()
     assert 'aria-label="3D view of scene yard"' in page and 'aria-label="3D view of house"' in page
     drawn = {path.name for path in (results / "objects/house/figures").glob("*.png")}
-    assert {"before_after.png", "registration.png", "object.png"} <= drawn
+    assert {"before_after.png", "object.png"} <= drawn
     assert "missing.png" not in drawn
     assert json.loads((results / "objects/house/metrics.json").read_text())["completion"]
 

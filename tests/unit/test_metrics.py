@@ -7,7 +7,7 @@ import pytest
 
 from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import quantity, read_json, write_json
-from scenefuse.core.transforms import Sim3, rotation_between
+from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.surface import SAMPLED_POINTS
 from scenefuse.metrics.completion import (
     Completion,
@@ -267,7 +267,6 @@ def test_the_size_is_that_of_the_upright_box_however_the_object_stands_in_the_sc
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.5, (20_000, 3)) * [4, 2, 3]
     points[:5] *= 9  # stray points do not make it larger
-    turned, tipped = np.radians(30), np.array([0.0, 1.0, 0.0])
+    turned = np.radians(30)
     turn = np.array([[np.cos(turned), -np.sin(turned), 0], [np.sin(turned), np.cos(turned), 0], [0, 0, 1]])
-    for frame, up in ((turn, np.array([0.0, 0, 1])), (rotation_between(np.array([0.0, 0, 1]), tipped) @ turn, tipped)):
-        np.testing.assert_allclose(box_size(points @ frame.T + 100.0, up), [4, 2, 3], rtol=0.05)
+    np.testing.assert_allclose(box_size(points @ turn.T + 100.0), [4, 2, 3], rtol=0.05)

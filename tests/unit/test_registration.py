@@ -176,7 +176,7 @@ def test_color_agreement_ignores_gain_and_bias_but_not_place(house):
 def test_gravity_counts_only_where_it_was_measured_on_both_sides(tmp_path, of_object, of_scene, used):
     cues = [{} if cue is None else {"up_cue": quantity(cue, "")} for cue in (of_object, of_scene)]
     write_json(tmp_path / "undistorted.json", cues[0] | {"up_in_camera_frame": quantity([0, 0.0, 2.0], "1")})
-    write_json(tmp_path / "crop.json", cues[1] | {"up_in_scene": quantity([0.0, 0, 1], "")})
+    write_json(tmp_path / "crop.json", cues[1])
     inputs = Inputs(
         tmp_path / "object.ply", tmp_path / "crop.ply", tmp_path / "crop.json", tmp_path / "undistorted.json"
     )
@@ -187,7 +187,7 @@ def stage_inputs(folder, obj, scene, up_in_object=None):
     """The files of two clouds as the stages read them; gravity is known when the object's up is given."""
     write_cloud(folder / "object.ply", obj)
     write_cloud(folder / "crop.ply", scene)
-    write_json(folder / "crop.json", {"up_in_scene": quantity(Z, ""), "diagonal": quantity(1.0, "m")})
+    write_json(folder / "crop.json", {"diagonal": quantity(1.0, "m")})
     write_json(folder / "undistorted.json", {"up_in_camera_frame": quantity(up_in_object, "")})
     return Inputs(folder / "object.ply", folder / "crop.ply", folder / "crop.json", folder / "undistorted.json")
 

@@ -8,8 +8,8 @@ import pytest
 from support.browser import chromium, click, touch
 
 from scenefuse.cloud.clouds import Cloud
-from scenefuse.core.stage import quantity, write_json
-from scenefuse.core.transforms import UP, rotation_between
+from scenefuse.core.stage import write_json
+from scenefuse.core.transforms import UP
 from scenefuse.report.view import VIEW_POINTS, View, encode, merge, write_view
 from scenefuse.report.write_report import write_report
 from scenefuse.surface.gltf import BRIDGED_TINT, write_glb
@@ -180,11 +180,10 @@ def test_every_way_of_colouring_changes_the_picture_and_has_its_legend(opened):
 
 def test_the_surface_is_shown_with_photos_class_and_deviation_beside_the_points(browser, tmp_path):
     """A plane that a picture paints, red on its far half and blue on its near one, with a bridged strip beside it."""
-    turned = rotation_between(np.array([0.0, 1, 0]), UP)
     corners = np.array([[-1, -0.8], [0.6, -0.8], [0.6, 0.8], [-1, 0.8], [0.6, -0.8], [1, -0.8], [1, 0.8], [0.6, 0.8]])
-    points = np.column_stack([corners, np.full(8, 0.4)]) @ turned
+    points = np.column_stack([corners, np.full(8, 0.4)])
     fields = {"deviation": np.float32([0.001] * 4 + [np.nan] * 4), "class": np.uint8([1] * 4 + [2] * 4)}
-    vertices = Cloud(points, np.tile(np.float32(turned[2]), (8, 1)), np.zeros((8, 3), np.uint8), fields)
+    vertices = Cloud(points, np.tile(np.float32(UP), (8, 1)), np.zeros((8, 3), np.uint8), fields)
     faces = np.array([[0, 1, 2], [2, 3, 0], [4, 5, 6], [6, 7, 4]])
     surface = Surface(vertices, faces, np.uint8([1, 1, 2, 2]), 0.0)
     uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]] * 2, np.float64)[faces]
@@ -192,8 +191,7 @@ def test_the_surface_is_shown_with_photos_class_and_deviation_beside_the_points(
     before, added = grid(), grid(9, 0.05, 0.4)
     deviation = np.linspace(0.001, 0.05, len(before) + len(added)).astype(np.float32)
     house = tmp_path / "house"
-    (house / "registration/full").mkdir(parents=True)
-    write_json(house / "registration/full/crop.json", {"up_in_scene": quantity([0, 1, 0], "")})
+    house.mkdir()
     (house / "fused.ply").touch()
     write_surface(house / "surface.ply", surface)
     write_glb(house / "surface.glb", surface, {}, 1.0, uv, picture)
@@ -223,7 +221,7 @@ def test_the_surface_is_shown_with_photos_class_and_deviation_beside_the_points(
         click(browser, stage, right * width, down * height)
     words = browser.find(f"{SECTION} .command").text.split()
     assert words[:6] == ["scenefuse", "export", "--what", "drawings", "--object", "house"]
-    clicked = np.array(words[7:], np.float64).reshape(3, 3) @ turned.T
+    clicked = np.array(words[7:], np.float64).reshape(3, 3)
     cloud = np.concatenate([before.points, added.points])
     assert np.linalg.norm(cloud[:, None] - clicked, axis=2).min(0).max() < 1e-3 and len(np.unique(clicked, axis=0)) == 3
     choose(browser, "Draw a facade")

@@ -410,8 +410,8 @@ def test_a_damaged_json_counts_as_absent(tmp_path):
 def report(results, names=("house", "balloon", "sculpture"), lone=()):
     figures = results / "objects/house/figures"
     figures.mkdir(parents=True)
-    for name in ("before", "after", "registration"):
-        Image.fromarray(np.full((30, 40, 3), 90, dtype=np.uint8)).save(figures / f"{name}.png")
+    for name in ("figures/before.png", "figures/after.png", "registration/full/fine.png"):
+        Image.fromarray(np.full((30, 40, 3), 90, dtype=np.uint8)).save(figures.parent / name)
     page = results / "report.html"
     write_report(
         summary=summarise(results, names, lone),

@@ -186,7 +186,7 @@ def capture(tmp_path_factory):
     write_cloud(folder / "missing.ply", Cloud(top, None, None, {"missing": kinds}))
     write_json(folder / "missing.json", {"missing": quantity(0.1, "")})
     (folder / "next_photos.csv").write_text("station,photo,x,y,z\n1,1,3,0,3\n1,2,3,1,3\n1,3,3,2,3\n")
-    write_json(folder / "crop.json", {"up_in_scene": quantity([0.0, 0.0, 1.0], ""), "diagonal": quantity(2.4, "m")})
+    write_json(folder / "crop.json", {"diagonal": quantity(2.4, "m")})
     model = pycolmap.Reconstruction()
     pinhole = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[60, 60, 32, 24], camera_id=1)
     model.add_camera_with_trivial_rig(pinhole)
@@ -265,7 +265,6 @@ def test_figures_show_what_was_added(figures):
     names = {
         "missing.png",
         "before_after.png",
-        "registration.png",
         "object.png",
         "before.png",
         "after.png",
@@ -337,7 +336,7 @@ def test_the_3d_view_of_a_large_scene_shows_one_in_so_many_points_and_all_of_an_
 def test_a_refused_object_without_a_pose_still_gets_its_figures(capture, tmp_path):
     fine = {"status": quantity("unregistered", ""), "reason": quantity("two poses fit equally well", "")}
     draw(capture, fine, tmp_path / "figures")
-    assert (tmp_path / "figures/registration.png").is_file()
+    assert (tmp_path / "figures/before_after.png").is_file()
     assert read_view(tmp_path / "figures") is None
 
 

@@ -324,8 +324,8 @@ class View {
 
   // The command that draws the plane through the picked points.
   facade() {
-    const { name, scene_from_view: rows } = this.about.surface;
-    const places = this.picked.map(([x, y, z]) => rows.map(([a, b, c, d]) => a * x + b * y + c * z + d));
+    const { name, middle } = this.about.surface;
+    const places = this.picked.map((point) => middle.map((along, axis) => along + point[axis]));
     const numbers = places.flat().map((x) => Number(x.toPrecision(8))).join(" ");
     this.command.textContent = `scenefuse export --what drawings --object ${name} --facade ${numbers}`;
     this.output.textContent = "Below is the command that draws it.";
