@@ -15,6 +15,7 @@ from PIL import Image, ImageOps
 
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.photos.frames import sharpness
+from scenefuse.photos.photo_files import open_picture
 
 TILE_PX = 256
 # Longer side of a thumbnail.
@@ -76,18 +77,14 @@ def read_upright(path: Path, min_px: int | None = None) -> Pixels:
     Raises:
         StageError: it cannot be read.
     """
-    try:
-        # By handle: opened by name, Pillow 13 scrambles rotated TIFF files that are not RGB.
-        with open(path, "rb") as file, Image.open(file) as stored:
-            if min_px is not None:
-                stored.draft("RGB", (min_px, min_px))
-            image = ImageOps.exif_transpose(stored)
-            # Sixteen-bit grey is not scaled by Pillow's conversion.
-            if image.mode.startswith("I;16"):
-                image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
-            return np.asarray(image.convert("RGB"))
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise StageError(f"{path} cannot be read as a picture ({error}); replace it, or take it away") from None
+    with open_picture(path) as stored:
+        if min_px is not None:
+            stored.draft("RGB", (min_px, min_px))
+        image = ImageOps.exif_transpose(stored)
+        # Sixteen-bit grey is not scaled by Pillow's conversion.
+        if image.mode.startswith("I;16"):
+            image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+        return np.asarray(image.convert("RGB"))
 
 
 def at_most(pixels: Pixels, side_px: int) -> Pixels:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import yaml
-from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.photos.photo_files import open_picture
 from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.report.run_summary import ALONE, ObjectSummary
 from scenefuse.report.values import asset, find, length, percent, read_table
@@ -215,10 +215,10 @@ def photographed(scene: Path) -> str | None:
     days = set()
     for name in names[:: max(1, len(names) // LOOKED_AT)]:
         try:
-            with Image.open(scene / "photos" / name) as image:
+            with open_picture(scene / "photos" / name) as image:
                 exif = image.getexif()
-            taken = exif.get_ifd(IFD.Exif).get(Base.DateTimeOriginal) or exif.get(Base.DateTime)
-        except (OSError, ValueError, Image.DecompressionBombError):
+                taken = exif.get_ifd(IFD.Exif).get(Base.DateTimeOriginal) or exif.get(Base.DateTime)
+        except StageError:
             continue
         if taken:
             days.add(str(taken)[:10].replace(":", "-"))

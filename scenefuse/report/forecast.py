@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from PIL import Image
-from PIL.ExifTags import IFD, Base
+from PIL.ExifTags import IFD
 
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.photos.photo_files import photo_files
+from scenefuse.photos.photo_files import open_picture, photo_files, upright_size
 from scenefuse.report.values import parts_of, size_text
 from scenefuse.sfm.matches import MatchSettings
 
@@ -74,13 +73,10 @@ class Photos:
             return Photos(count, width, round(0.75 * width), kind == "scene")
         try:
             files = photo_files(Path(row["photos"]))
-            with Image.open(files[0]) as first:
-                exif = first.getexif()
-                # Of the orientations 1 to 8, the last four are turned by a quarter.
-                turned = exif.get(Base.Orientation, 1) > 4
-                width, height = reversed(first.size) if turned else first.size
-                with_gps = bool(exif.get_ifd(IFD.GPSInfo))
-        except (OSError, StageError, Image.DecompressionBombError):
+            width, height = upright_size(files[0])
+            with open_picture(files[0]) as first:
+                with_gps = bool(first.getexif().get_ifd(IFD.GPSInfo))
+        except StageError:
             return None
         count = len(files)
         if kind == "object":
