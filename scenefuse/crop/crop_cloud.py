@@ -65,7 +65,6 @@ class Crop:
 
     Attributes:
         keep: (N,) bool over the scene's points, True on the object.
-        in_box: (N,) bool, True for all points in the box or hull, ground included.
         on_ground: (N,) bool, True for points in it that were removed as ground.
         shape: box, oriented or hull: what was cut out; None for the whole scene.
         level_from_scene: (3, 3) rotation that turns the scene's up into z, and the box's sides into x and y.
@@ -76,7 +75,6 @@ class Crop:
     """
 
     keep: NDArray[np.bool_]
-    in_box: NDArray[np.bool_]
     on_ground: NDArray[np.bool_]
     shape: str | None
     level_from_scene: Array
@@ -90,9 +88,7 @@ def whole(scene: Cloud) -> Crop:
     """The whole scene as a crop."""
     everything = np.ones(len(scene), dtype=bool)
     note = "nothing was cut out: the object is looked for in the whole scene, as if that showed little else"
-    return Crop(
-        everything, everything, ~everything, None, np.eye(3), scene.points.min(0), scene.points.max(0), None, [note]
-    )
+    return Crop(everything, ~everything, None, np.eye(3), scene.points.min(0), scene.points.max(0), None, [note])
 
 
 def crop_cloud(
@@ -107,7 +103,7 @@ def crop_cloud(
     if settings.minimal:
         low, high = marks.min(0), marks.max(0)
         inside = ((points >= low) & (points <= high)).all(1)
-        return Crop(inside, inside, np.zeros_like(inside), "box", level, low, high, None, [])
+        return Crop(inside, np.zeros_like(inside), "box", level, low, high, None, [])
     diagonal = float(np.linalg.norm(extent))
     margin = settings.margin * extent + 2 * SCORE_FRACTION * diagonal
     low, high = marks.min(0) - margin, marks.max(0) + margin
@@ -134,7 +130,7 @@ def crop_cloud(
             notes.append("the ground around the box does not continue into it: nothing was removed as ground")
     keep = in_box & ~away if other is None else in_box & ~away & ~other
     keep, said = _without_loose_parts(points, keep, marks, diagonal)
-    return Crop(keep, in_box, away, shape, level, low, high, ground, notes + said)
+    return Crop(keep, away, shape, level, low, high, ground, notes + said)
 
 
 def _without_loose_parts(

@@ -19,6 +19,7 @@ from scenefuse.marks.clicks import Click, in_photos
 from scenefuse.marks.triangulation import MAX_CLICK_MISS, intersect, model_pixel, read_ends
 from scenefuse.photos.photos import Photo
 from scenefuse.photos.positions import cells_of
+from scenefuse.photos.workspace import images_by_name
 
 if TYPE_CHECKING:
     import pycolmap
@@ -162,13 +163,11 @@ class LocatedPoint:
     Attributes:
         point: the point, with the clicks that agree, in pixels of the model's photos.
         x_in_model: (3,) its place by these clicks; NaN where they give none.
-        off_px: (N,) their distances in pixels from that place in the photos.
         problem: why it takes no part, or "".
     """
 
     point: SurveyedPoint
     x_in_model: Array
-    off_px: Array
     problem: str = ""
 
 
@@ -223,7 +222,7 @@ def locate_points(
     Raises:
         StageError: a click in a photo that does not exist, or outside its photo.
     """
-    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    images = images_by_name(model)
     located, notes = [], []
     for point in control.points:
         seen, lost = [], []
@@ -237,7 +236,7 @@ def locate_points(
             else:
                 lost.append(photo)
         notes += [f"{point.name}: {photo} could not be registered, its click is left out" for photo in lost]
-        located_point, dropped = _agreed(replace(point, clicks=seen), {image.name: image for image in images.values()})
+        located_point, dropped = _agreed(replace(point, clicks=seen), images)
         located.append(located_point)
         notes += dropped + ([f"{point.name} is left out: {located_point.problem}"] if located_point.problem else [])
     return located, notes
@@ -245,7 +244,7 @@ def locate_points(
 
 def _agreed(point: SurveyedPoint, images: Mapping[str, pycolmap.Image]) -> tuple[LocatedPoint, list[str]]:
     """A point by the largest set of its clicks that agree, and a line for every other click."""
-    nowhere = LocatedPoint(point, np.full(3, np.nan), np.zeros(0))
+    nowhere = LocatedPoint(point, np.full(3, np.nan))
     if len(point.clicks) < 2:
         where = f"in {point.clicks[0].photo} only" if point.clicks else "in no registered photo"
         return replace(nowhere, problem=f"it is clicked {where}; click it in two or more"), []
@@ -278,7 +277,7 @@ def _agreed(point: SurveyedPoint, images: Mapping[str, pycolmap.Image]) -> tuple
         for k, click in enumerate(point.clicks)
         if k not in agree
     ]
-    return LocatedPoint(replace(point, clicks=[point.clicks[k] for k in agree]), position, off[list(agree)]), dropped
+    return LocatedPoint(replace(point, clicks=[point.clicks[k] for k in agree]), position), dropped
 
 
 def off_px(position: Array, images: list[pycolmap.Image], pixels: Array) -> Array:
@@ -301,7 +300,7 @@ def seen_at(located: list[LocatedPoint], model: pycolmap.Reconstruction) -> tupl
 
     NaN where clicks give nothing.
     """
-    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    images = images_by_name(model)
     places, rms_px = np.full((len(located), 3), np.nan), np.full(len(located), np.nan)
     for row, located_point in enumerate(located):
         if not located_point.problem:

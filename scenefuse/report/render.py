@@ -66,7 +66,6 @@ def orbit_camera(
     azimuth_deg: float,
     elevation_deg: float,
     size_px: tuple[int, int],
-    field_of_view_deg: float = 30.0,
     orthographic: bool = False,
     margin: float = 0.06,
 ) -> Camera:
@@ -77,7 +76,6 @@ def orbit_camera(
         azimuth_deg: direction from the middle to the camera, counter-clockwise from x.
         elevation_deg: angle above the horizontal; negative looks from below.
         size_px: width and height of the image.
-        field_of_view_deg: of the image's shorter side.
         orthographic: parallel instead of perspective projection.
         margin: free border as a share of the image.
     """
@@ -95,7 +93,8 @@ def orbit_camera(
         extent = np.maximum(np.abs(in_cam[:, :2]).max(0), 1e-9)
         distance = 2.0 * float(np.linalg.norm(np.ptp(framed, axis=0)))
         return Camera(rotation, middle + distance * direction, float((half / extent).min()), *size_px, True)
-    focal = min(size_px) / 2.0 / np.tan(np.radians(field_of_view_deg) / 2.0)
+    # The shorter side sees 30 degrees.
+    focal = min(size_px) / 2.0 / np.tan(np.radians(15.0))
     # The distance at which the outermost point touches the image's border.
     distance = float((np.abs(in_cam[:, :2] * focal / half).max(1) - in_cam[:, 2]).max())
     return Camera(rotation, middle + distance * direction, float(focal), *size_px)
@@ -103,7 +102,6 @@ def orbit_camera(
 
 def point_radii(
     points: Array,
-    neighbours: int = 4,
     factor: float = 0.9,
     limit: float = 3.0,
     source: NDArray[np.uint8] | None = None,
@@ -116,6 +114,7 @@ def point_radii(
     The spacing is the distance to the k-th neighbour, but not more than that of the neighbours themselves: a stray
     point off a dense surface is as small as the surface's points, and a sparse surface beside a dense one still closes.
     """
+    neighbours = 4
     if len(points) <= neighbours:
         return np.full(len(points), max(float(np.ptp(points, axis=0).max()) * 0.01, 1e-9) if len(points) else 0.0, "f4")
     most = min(2 * neighbours, len(points) - 1)
@@ -142,7 +141,6 @@ def render(
     radii: ArrayLike,
     colors: ArrayLike | None = None,
     background: tuple[int, int, int] = (255, 255, 255),
-    light: float = 0.35,
     eye_dome: float = 0.8,
 ) -> Image:
     """Draw a cloud as (H, W, 3) uint8 RGB.
@@ -153,7 +151,6 @@ def render(
         radii: (N,) disc radii in the cloud's unit, or one number for all (`point_radii`).
         colors: (N, 3) uint8 instead of the cloud's own colours; grey where there are none.
         background: RGB of empty pixels.
-        light: how much a surface seen edge-on is darkened, 0 to 1; from behind it gets darker still.
         eye_dome: strength of the dark rims at depth steps, 0 for none.
     """
     fine = replace(
@@ -162,7 +159,7 @@ def render(
         width_px=camera.width_px * SUPERSAMPLING,
         height_px=camera.height_px * SUPERSAMPLING,
     )
-    rgb = _base_colors(cloud, colors) * _head_light(cloud, camera, light)[:, None]
+    rgb = _base_colors(cloud, colors) * _head_light(cloud, camera)[:, None]
     pixels, depth = fine.project(cloud.points)
     slopes = _slopes(cloud, fine, pixels)
     radius = np.broadcast_to(np.asarray(radii, dtype=np.float32), (len(cloud),))
@@ -197,10 +194,11 @@ def _base_colors(cloud: Cloud, colors: ArrayLike | None) -> NDArray[np.float32]:
     return np.broadcast_to(np.asarray(chosen, dtype=np.float32), (len(cloud), 3))
 
 
-def _head_light(cloud: Cloud, camera: Camera, light: float) -> NDArray[np.float32]:
+def _head_light(cloud: Cloud, camera: Camera) -> NDArray[np.float32]:
     """(N,) factor: a lamp left above the camera; surfaces seen from behind get a third of the remaining light less."""
-    if cloud.normals is None or light <= 0:
+    if cloud.normals is None:
         return np.ones(len(cloud), dtype=np.float32)
+    light = 0.35  # by how much a surface seen edge-on is darker
     rotation = camera.cam_from_world.astype(np.float32)
     lamp = rotation.T @ (np.array([-0.35, -0.5, -0.8], dtype=np.float32) / np.float32(1.006))
     toward = -rotation[2] if camera.orthographic else camera.centre - cloud.points
