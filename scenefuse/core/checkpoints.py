@@ -157,14 +157,30 @@ def load_checkpoint(path: Path | None, like: State) -> State | None:
     if path is None or not path.is_file():
         return None
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        return read_state(path, like, "training starts afresh")
+    except StageError as error:
+        print(f"note: {error}", flush=True)
+        return None
+
+
+def read_state(path: Path, like: State, advice: str) -> State:
+    """A saved state, on the CPU.
+
+    Args:
+        path: of the file.
+        like: what it has to hold, with tensors of these shapes and types.
+        advice: what to do where it cannot be read, the end of a sentence.
+
+    Raises:
+        StageError: the file is damaged, or holds something else.
+    """
+    try:
+        state: State = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a truncated file raises any of half a dozen
         why = " ".join(str(error).split())[:200] or type(error).__name__
-        print(f"note: {path} cannot be read ({why}); training starts afresh", flush=True)
-        return None
+        raise StageError(f"{path} cannot be read ({why}); {advice}") from None
     if not _fits(state, like):
-        print(f"note: {path} was saved by another version; training starts afresh", flush=True)
-        return None
+        raise StageError(f"{path} was saved by another version; {advice}")
     return state
 
 

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from scenefuse.core.checkpoints import read_state
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, quantity, threads, value, write_json
 from scenefuse.core.transforms import Sim3
@@ -278,13 +279,7 @@ def read_nerf(stage: Path) -> dict[str, Any]:
     path = stage / "model.pt"
     if not path.is_file():
         raise StageError(f"{path} does not exist; run the NeRF stage first")
-    try:
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception:  # a truncated file raises any of half a dozen
-        raise StageError(f"{path} is damaged; delete {stage} and run the NeRF stage again") from None
-    if "log_gain" not in saved:
-        raise StageError(f"{path} is of an earlier version, without the photos' gains; run the NeRF stage again")
-    return saved
+    return read_state(path, {"model": {}, "names": []}, f"delete {stage} and run the NeRF stage again")
 
 
 def measure_quality(

@@ -93,7 +93,6 @@ def chain_quantities(own: Array, known: Array, used: Array, pose_source: str) ->
     error = trajectory_error("chain", own, known)
     return {
         "pose_source": quantity(pose_source, ""),
-        "frame": quantity("sfm", ""),
         "up_in_camera_frame": quantity(estimate_up(used[:, :3, :3], used[:, :3, 3])[0], "1"),
         **error,
     }
@@ -225,7 +224,7 @@ class Stage:
         write_json(self.outputs.posed_json, chain)
         content |= {
             "steps": quantity(recipe.steps(self.frames), "1"),
-            **{name: part for name, part in chain.items() if name not in ("frame", "up_in_camera_frame")},
+            **{name: part for name, part in chain.items() if name != "up_in_camera_frame"},
             "unit": quantity(placed.unit, "object units per unit of the networks"),
             **monocular.map_quantities(depth, placed.measured),
             **loss_quantities(losses),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scenefuse.core.checkpoints import State
+from scenefuse.core.checkpoints import State, read_state
 from scenefuse.core.stage import StageError, quantity, setting
 from scenefuse.core.transforms import Array, rotation_angle_deg
 from scenefuse.nerf.monodepth import (
@@ -108,14 +108,11 @@ def load_networks(path: Path, device: torch.device) -> tuple[Networks, int, floa
         StageError: the file is missing or damaged.
     """
     networks = new_monocular_networks(device)
-    try:
-        saved = torch.load(path, map_location=device, weights_only=True)
-        for name, network in networks.parts().items():
-            network.load_state_dict(saved[name])
-        return networks, saved["width_px"], saved["unit"]
-    except Exception as error:  # a truncated file raises any of half a dozen
-        why = " ".join(str(error).split())[:200]
-        raise StageError(f"{path} cannot be read ({why}); delete its folder and run stage 1 again") from None
+    like = networks.state() | {"width_px": 0, "unit": 0.0}
+    saved = read_state(path, like, "delete its folder and run stage 1 again")
+    for name, network in networks.parts().items():
+        network.load_state_dict(saved[name])
+    return networks, saved["width_px"], saved["unit"]
 
 
 @torch.no_grad()

@@ -131,7 +131,6 @@ def _report(best: Hypothesis, problem: Problem, length: str, seconds: float) -> 
         "margin": quantity(None, "1"),
         "tilt_deg": quantity(tilt_deg(best.pose, problem.known.ups), "deg"),
         **uncertainty_quantities(None, length),
-        "source": quantity(best.source, ""),
         "hypotheses": quantity([best.as_json()], ""),
         "seconds": quantity(seconds, "s"),
     }

@@ -121,7 +121,6 @@ def _report(outcome: Outcome, problem: Problem, seconds: float) -> dict[str, Any
         "margin": quantity(decision.margin, "1"),
         "free_axis": quantity(decision.free_axis, ""),
         "tilt_deg": quantity(tilt_deg(best.pose, problem.known.ups), "deg"),
-        "source": quantity(best.source, ""),
         "rival": quantity(None if decision.rival is None else decision.rival.as_json(), ""),
         "hypotheses": quantity([h.as_json() for h in outcome.ranked], ""),
         "seconds": quantity(seconds, "s"),
@@ -154,18 +153,9 @@ def _stated(outcome: Outcome, bending: tuple[Array | None, Array | None], length
 
 
 def pose_quantities(best: Hypothesis) -> dict[str, Any]:
-    """A pose and its scores as a stage JSON holds them."""
-    score = best.score
-    return {
-        "scene_from_object": quantity(best.pose.matrix, ""),
-        "scale": quantity(best.pose.scale, "scene units per object unit"),
-        "f_score": quantity(score.f_score, "1"),
-        "precision": quantity(score.precision, "1"),
-        "recall": quantity(score.recall, "1"),
-        "color_agreement": quantity(score.color, "1"),
-        "free_space_violation": quantity(score.free_space_violation, "1"),
-        "score": quantity(score.total, "1"),
-    }
+    """A pose, its source and its scores as a stage JSON holds them."""
+    units = {"scene_from_object": "", "scale": "scene units per object unit", "source": ""}
+    return {name: quantity(number, units.get(name, "1")) for name, number in best.as_json().items()}
 
 
 def draw_alignment(path: Path, cloud: Cloud, scene: Cloud, scene_from_object: Sim3, seed: int) -> None:

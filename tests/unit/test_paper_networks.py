@@ -69,11 +69,12 @@ def test_true_depth_agrees_between_views_and_wrong_depth_does_not():
 
 def test_networks_that_cannot_be_read_are_one_sentence(tmp_path):
     networks = tmp_path / "networks.pt"
+    said = "networks.pt (cannot be read|was saved by another version).* run stage 1 again"
     for spoil in (
         lambda: None,
         lambda: torch.save({"weights": torch.zeros(1)}, networks),
         lambda: networks.write_bytes(networks.read_bytes()[:200]),
     ):
         spoil()
-        with pytest.raises(StageError, match="networks.pt cannot be read .* run stage 1 again"):
+        with pytest.raises(StageError, match=said):
             load_networks(networks, torch.device("cpu"))
