@@ -7,10 +7,9 @@ balance.
 
 from dataclasses import dataclass
 
-import cv2
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import avg_pool2d, conv2d, max_pool2d
 
 from scenefuse.nerf.field import Field
 from scenefuse.nerf.rays import COLOR_DELTA, PhotoTensors, dilate
@@ -240,13 +239,18 @@ def measured_sharpness(images: Tensor, masks: Tensor) -> Tensor:
     for index, (image, mask) in enumerate(zip(images, dilate(masks, -round(COARSE_PX)))):
         if mask.sum() < 2:
             continue
-        gray = image.float().mean(2)
+        gray = image.float().mean(2)[None]
         smooth = blurred(gray, 1.0)
-        found[index] = (gray - smooth)[mask].std() / (smooth - blurred(gray, COARSE_PX))[mask].std().clamp(min=1e-6)
+        found[index] = (gray - smooth)[:, mask].std() / (smooth - blurred(gray, COARSE_PX))[:, mask].std().clamp(
+            min=1e-6
+        )
     return torch.where(found.isnan(), found.nanmedian().nan_to_num(1.0), found)
 
 
-def blurred(picture: Tensor, sigma: float) -> Tensor:
-    """A picture (H, W) or (H, W, C) under a Gaussian of sigma pixels, cut off at three sigma, with zeros around it."""
-    size = 2 * int(3 * sigma + 0.5) + 1
-    return torch.from_numpy(cv2.GaussianBlur(picture.numpy(), (size, size), sigma, borderType=cv2.BORDER_CONSTANT))
+def blurred(planes: Tensor, sigma: float) -> Tensor:
+    """Planes (C, H, W) under a Gaussian of sigma pixels, cut off at three sigma, with zeros around them."""
+    reach = int(3 * sigma + 0.5)
+    line = torch.exp(-((torch.arange(-reach, reach + 1) / sigma) ** 2) / 2)
+    line = (line / line.sum()).view(1, 1, 1, -1)
+    rows = conv2d(planes[:, None], line, padding=(0, reach))
+    return conv2d(rows, line.transpose(2, 3), padding=(reach, 0))[:, 0]

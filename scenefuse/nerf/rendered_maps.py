@@ -338,11 +338,12 @@ def psnr(a: Tensor, b: Tensor, where: Tensor) -> float:
 
 def ssim(a: Tensor, b: Tensor, where: Tensor) -> float:
     """Structural similarity (Wang et al. 2004) of (H, W, 3) pictures in 0..1; Gaussian window, sigma 1.5 pixels."""
-    mean_a, mean_b, aa, bb, ab = (blurred(picture, 1.5) for picture in (a, b, a * a, b * b, a * b))
+    a, b = (picture.permute(2, 0, 1) for picture in (a, b))
+    mean_a, mean_b, aa, bb, ab = (blurred(planes, 1.5) for planes in (a, b, a * a, b * b, a * b))
     c1, c2 = 0.01**2, 0.03**2
     covariance, spread = ab - mean_a * mean_b, (aa - mean_a**2) + (bb - mean_b**2)
     score = (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (spread + c2))
-    return float(score.mean(2)[where].mean())
+    return float(score[:, where].mean())
 
 
 def silhouette_iou(opacity: Tensor, mask: Tensor) -> float:
