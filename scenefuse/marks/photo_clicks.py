@@ -83,8 +83,8 @@ def clicks_per_photo(
             where these are not known, and photos have the size of their cameras.
 
     Returns:
-        The clicks, and a sentence for each that is left out since its photo is not used or has no camera, or since its
-        place is cut away when the photo is undistorted.
+        The clicks, and a sentence for each photo whose clicks are left out: it is not used, has no camera, or their
+        places are cut away when it is undistorted.
 
     Raises:
         StageError: a click outside its photo, a box that is not two corners, no click inside and no box in a photo with
@@ -92,7 +92,7 @@ def clicks_per_photo(
     """
     images = images_by_name(read_model(sparse))
     rows = {view.name: k for k, view in enumerate(views)}
-    left_out: list[str] = []
+    lost: dict[str, list[Click]] = {}
     found: dict[int, list[tuple[Click, Array]]] = {}
     for click in in_photos(labels.rows, [*images, *(sizes or ())], labels.path):
         photo = click.photo
@@ -101,17 +101,19 @@ def clicks_per_photo(
             undistorted = _undistorted(labels.path, click, images[photo], view, sizes)
             beyond = ((undistorted < 0) | (undistorted > [view.width, view.height])).any()
             if not np.isfinite(undistorted).all() or (sizes is not None and beyond):
-                left_out.append(f"{click} is in {photo}, whose edge is cut away there when it is undistorted")
+                lost.setdefault(f"{photo}, whose edge is cut away there when it is undistorted", []).append(click)
             else:
                 found.setdefault(rows[photo], []).append((click, undistorted))
         elif sizes is None or photo in sizes:
             why = ", or is none of the photos" if sizes is None else ""
-            left_out.append(f"{click} is in {photo}, which has no camera (it could not be registered{why})")
+            lost.setdefault(f"{photo}, which has no camera (it could not be registered{why})", []).append(click)
         else:
-            left_out.append(
-                f"{click} is in {photo}, which is not among the photos that are used: renamed since, or left out by"
-                " object.frames (max_frames, frame_step)"
-            )
+            unused = f"{photo}, which is not among the photos that are used: renamed since, or left out by"
+            lost.setdefault(f"{unused} object.frames (max_frames, frame_step)", []).append(click)
+    left_out = [
+        f"{clicks[0]} is in {place}" if len(clicks) == 1 else f"{len(clicks)} clicks, {clicks[0]} first, are in {place}"
+        for place, clicks in lost.items()
+    ]
     clicked = {k: _of_photo(labels.path, views[k].name, clicks) for k, clicks in sorted(found.items())}
     if not any(clicks.prompt for clicks in clicked.values()):
         if left_out:

@@ -65,6 +65,10 @@ def test_a_click_in_a_photo_without_a_camera_is_left_out_where_others_say_what_t
     found, left_out = clicks_per_photo(labels, model, photos.views, SIZES)
     sentence = "the click inside at (5, 5) is in lost.png, which has no camera (it could not be registered)"
     assert list(found) == [3] and left_out == [sentence]
+    labels = read(tmp_path, [*rows, ("outside", "lost.png", 7, 5)])
+    assert clicks_per_photo(labels, model, photos.views, SIZES)[1] == [
+        "2 clicks, the click inside at (5, 5) first, are in lost.png, which has no camera (it could not be registered)"
+    ]
 
 
 def test_a_click_in_a_photo_that_is_not_used_is_left_out_where_others_say_what_the_object_is(tmp_path, model, photos):
