@@ -19,8 +19,6 @@ from scenefuse.core.stage import StageError
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-# Positions of the photos beside it, as OpenDroneMap names the file.
-GEO_FILE = "geo.txt"
 JPEG = (".jpg", ".jpeg", ".jpe", ".jfif")
 SUFFIXES = (*JPEG, ".png", ".tif", ".tiff", ".bmp", ".ppm")
 VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts"}
@@ -129,6 +127,11 @@ def photo_files(folder: Path) -> list[Path]:
             f" ({len(files)} other files were found)"
         )
     return sorted(photos, key=lambda file: file.relative_to(folder).as_posix())
+
+
+def geo_file(folder: Path) -> Path | None:
+    """The positions of a folder's photos, in the file that OpenDroneMap calls geo.txt, if there is one."""
+    return min(folder.glob("[Gg][Ee][Oo].[Tt][Xx][Tt]"), default=None)
 
 
 def pictures_below(folder: Path) -> dict[str, Path]:

@@ -13,7 +13,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, value, write_json
-from scenefuse.photos.photo_files import GEO_FILE, JPEG, in_folders, open_picture, photo_files
+from scenefuse.photos.photo_files import JPEG, geo_file, in_folders, open_picture, photo_files
 from scenefuse.photos.pictures import JPEG_QUALITY, read_raw, stretched
 from scenefuse.photos.positions import exif_number, exif_text, positions_of, read_geo, stated_position
 
@@ -88,19 +88,20 @@ def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
         StageError: the folder is missing or holds no photo, a photo cannot be decoded, or geo.txt is not well formed.
     """
     names, copies = without_copies(folder, photo_names(folder))
-    positions = read_geo(folder / GEO_FILE) if (folder / GEO_FILE).is_file() else None
+    geo = geo_file(folder)
+    positions = read_geo(geo) if geo else {}
     stored = each_photo(lambda name: inspect_photo(folder, name), names)
     bits = bits_to_stretch(stored)
     with atomic_directory(upright) as temporary:
         listed = each_photo(lambda photo: _stood_upright(folder, photo, temporary, bits), stored)
     turned = {p.name: p.orientation for p in stored if p.orientation != 1}
-    if positions is not None:
-        places = positions_of(names, positions, folder / GEO_FILE)
+    if geo:
+        places = positions_of(names, positions, geo)
         listed = [replace(p, position_note="", **place) for p, place in zip(listed, places)]
     notes = copies + below_folder(names) + photo_notes(listed, bits)
-    if positions is not None:
+    if geo:
         notes.append(
-            f"{GEO_FILE} gives {sum(p.has_gps for p in listed)} of {len(listed)} positions; EXIF's are not used"
+            f"{geo.name} gives {sum(p.has_gps for p in listed)} of {len(listed)} positions; EXIF's are not used"
         )
     if turned:
         first = next(iter(turned))

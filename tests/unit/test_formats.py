@@ -227,6 +227,11 @@ def test_names_in_another_order_that_do_not_fit_the_rows_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
+        (
+            "Punkt;Y-Koordinate;X-Koordinate;Höhe\n".encode() + b"P1;1.5;2;3\n" * 4,
+            "column Y-Koordinate is the easting or",
+        ),
+        (b"X Koordinate\tY Koordinate\tZ\n" + b"1.5\t2\t3\n" * 4, "column X Koordinate is the easting or"),
         (b"ncols 4\nnrows 2\nxllcorner 1\nyllcorner 2\ncellsize 1\n1 2 3 4\n5 6 7 8\n", "is a raster of heights"),
         (b"DSAA\r\n4 2\r\n0 3\r\n0 1\r\n1 8\r\n1 2 3 4\r\n5 6 7 8\r\n", "is a raster of heights"),
         (b"1\n1\n" + b"0 0 0\n" * 4 + b"1 0 0 0\n" * 4 + b"1 2 3 0.5\n", "is PTX, whose scans have poses"),

@@ -43,6 +43,7 @@ def reds(cloud):
         ("blank_crlf.ply", HEAD.format(40) + "end_header\n\r\n" + "\r\n\r\n".join(rows())),
         ("mark.ply", "\ufeff" + HEAD.format(40) + "end_header\n\ufeff" + "\n".join(rows())),
         ("carriage.xyz", "\r".join(rows())),
+        ("joined.xyz", "\r".join(rows()[:9]) + "\r" + "\n".join(rows()[9:])),
         ("dos.xyz", "\r\n".join([*rows(), "\x1a"])),
         ("quoted.csv", "x,y,z\n" + "\n".join('"' + '","'.join(map(str, row)) + '"' for row in GRID)),
         ("spaced.csv", "x , y , z\n" + "\n".join(rows(" , "))),
@@ -291,12 +292,16 @@ def test_scaled_integers_of_e57_are_scaled(tmp_path):
 
 
 @pytest.mark.parametrize("data", ["ascii", "binary"])
-@pytest.mark.parametrize("kind", ["F", "U"])
+@pytest.mark.parametrize("kind", ["F", "U", "F, written as an integer", "F, written as a signed integer"])
 def test_packed_colours_of_pcd_as_a_real_number_or_an_integer(tmp_path, data, kind):
-    packed = np.array([r << 16 | g << 8 | b for r, g, b in COLORS], np.uint32)
+    kind, _, integer = kind.partition(", written as ")
+    opaque = 255 << 24 if integer else 0
+    packed = np.array([opaque | r << 16 | g << 8 | b for r, g, b in COLORS], np.uint32)
     table = np.empty(40, [("xyz", "<f4", 3), ("pad", "u1", 5), ("rgb", "<u4")])
     table["xyz"], table["rgb"] = GRID, packed
-    shown = [repr(float(n)) for n in packed.view(np.float32).astype(np.float64)] if kind == "F" else packed.tolist()
+    shown = packed.view(np.int32).tolist() if "signed" in integer else packed.tolist()
+    if kind == "F" and not integer:
+        shown = [repr(float(n)) for n in packed.view(np.float32).astype(np.float64)]
     head = f"FIELDS x y z _ rgb\nSIZE 4 4 4 1 4\nTYPE F F F U {kind}\nCOUNT 1 1 1 5 1\nWIDTH 8\nHEIGHT 5\nDATA {data}\n"
     text = "\n".join(rows(" ", *[[0] * 40] * 5, shown)).encode()
     (tmp_path / "a.pcd").write_bytes(head.encode() + (text if data == "ascii" else table.tobytes()))

@@ -349,13 +349,14 @@ def test_accuracies_are_read_from_xmp(tmp_path):
     assert gps_accuracies(list(photos.values()), 3.0)[2].tolist() == [3.0, 3.0]
 
 
-def test_a_geo_file_takes_the_place_of_exif(tmp_path, capsys):
+@pytest.mark.parametrize("name", ["geo.txt", "GEO.TXT"])
+def test_a_geo_file_takes_the_place_of_exif(tmp_path, capsys, name):
     folder = tmp_path / "flight"
-    for name in ("a.jpg", "b.jpg", "c.jpg"):
-        a_photo(folder, name)
+    for photo in ("a.jpg", "b.jpg", "c.jpg"):
+        a_photo(folder, photo)
     x, y = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(8.5, 47.4)
     lines = ["EPSG:32632", f"a.jpg {x} {y} 431.5 10 -90 0 0.02 0.04", f"b.jpg {x + 5} {y}", f"z.jpg {x} {y}"]
-    (folder / "geo.txt").write_text("\n".join(lines))
+    (folder / name).write_text("\n".join(lines))
     photos = listed(folder, tmp_path)
     assert photos["a.jpg"].latitude_deg == pytest.approx(47.4, abs=1e-8)
     assert (photos["a.jpg"].altitude_m, photos["a.jpg"].vertical_sd_m) == (431.5, 0.04)

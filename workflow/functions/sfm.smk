@@ -14,9 +14,9 @@ def photos_of(row, who):
 def scene_photos(wildcards):
     """The photos of a scene, and the file of their positions where there is one."""
     folder = photos_of(scene_row(wildcards.scene), f"scene '{wildcards.scene}'")
-    positions = Path(folder) / GEO_FILE
     photos = photos_in(folder, f"{config['scenes']}, scene '{wildcards.scene}'")
-    return photos + ([str(positions)] if positions.is_file() else [])
+    positions = geo_file(Path(folder))
+    return photos + ([str(positions)] if positions else [])
 
 
 def scene_folder(wildcards):

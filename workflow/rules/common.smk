@@ -17,7 +17,7 @@ from scenefuse.core.fingerprint import files_fingerprint, fingerprint
 from scenefuse.core.project import read_project
 from scenefuse.core.settings import PACKAGE, ROOT as SHIPPED
 from scenefuse.core.machine import has_gpu, megapixels, memory_mb
-from scenefuse.photos.photo_files import GEO_FILE, camera_files, photo_files
+from scenefuse.photos.photo_files import camera_files, geo_file, photo_files
 from scenefuse.core.stage import DISK_FULL, MIN_FREE_BYTES, StageError
 
 # A file that a run holds until it ends, among Snakemake's locks and removed with them.

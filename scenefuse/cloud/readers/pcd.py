@@ -141,6 +141,8 @@ def _columns(header: _Header, arrays: list[NDArray[Any]]) -> Columns:
         packed = columns.pop(name)
         if header.data == "ascii" and kind.kind == "f":
             packed = np.nan_to_num(packed)
+            if 1 <= np.abs(packed).max(initial=0) < 2**32:  # the integer itself, not the real number of its bits
+                packed, kind = packed.astype(np.int64), np.dtype(np.uint32)
         bits = np.ascontiguousarray(packed.astype(kind)).view(np.uint32)
         columns |= {color: (bits >> shift & 255).astype(np.uint8) for color, shift in zip(COLOR, (16, 8, 0))}
     return columns

@@ -34,6 +34,8 @@ NORTHING = ("y", "northing", "north", "n", "hochwert", "hw", "nordwert")
 ELEVATION = ("z", "elevation", "elev", "height", "h", "altitude", "alt", "hoehe", "höhe")
 BESIDE = {"m", "utm", "coord", "coords", "coordinate"}
 DEGREES = re.compile("lon|lat", re.IGNORECASE)
+# X is the easting in programs and the northing in German surveying.
+EAST_OR_NORTH = re.compile(r"[xy][\s_.-]*koord|koord\w*[\s_.-]*[xy]$", re.IGNORECASE)
 # How the grids of Esri, GRASS and Surfer begin.
 RASTER = re.compile(r"(ncols|nrows|north:|DSAA)\s", re.IGNORECASE)
 # By how much the better of two places for the colours among the columns has to be.
@@ -113,10 +115,13 @@ def text_layout(path: Path) -> TextLayout:
     else:
         _check_order(path, headers, rows.shape[1])
         names = next(iter(fitting), headers[0] if headers else [])
-        degrees = next((name for line in fitting or [names] for name in line if DEGREES.match(name)), None)
-        if degrees is not None:
+        called = [name for line in fitting or [names] for name in line]
+        for name in filter(DEGREES.match, called):
+            raise StageError(f"{path} is in degrees (column {name}); project it to metres first, to UTM for instance")
+        for name in filter(EAST_OR_NORTH.match, called):
             raise StageError(
-                f"{path} is in degrees (column {degrees}); project it to metres first, to UTM for instance"
+                f"{path}: whether column {name} is the easting or the northing cannot be told; name the columns"
+                " Rechtswert and Hochwert"
             )
         if first == 1:
             notes.append(f"{path.name}: its first column names or numbers the points and is left out")
@@ -143,13 +148,13 @@ def _lines(path: Path) -> Iterator[bytes]:
         halves = {name: begin[k::2] for k, name in enumerate(("utf-16-be", "utf-16-le"))}
         wide = next((name for name, half in halves.items() if 2 * half.count(0) > len(half)), "")
         wide = "utf-16" if begin.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else wide
-        if not wide and (b"\n" in begin or b"\r" not in begin):
+        if not wide and not re.search(rb"\r[^\r\n]", begin):
             file.seek(len(codecs.BOM_UTF8) if begin.startswith(codecs.BOM_UTF8) else 0)
             yield from file
             return
-    # Spreadsheets write UTF-16, and old Macs end lines by a carriage return alone.
+    # Spreadsheets write UTF-16, and old Macs end lines by a carriage return alone, some lines in a file put together.
     with open(path, encoding=wide or "latin-1", errors="replace") as text:
-        yield from (line.encode(errors="replace") for line in text)
+        yield from (line.encode("utf-8" if wide else "latin-1", "replace") for line in text)
 
 
 def _decoded(line: bytes) -> str:
