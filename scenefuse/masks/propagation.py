@@ -177,64 +177,49 @@ def _make(
     tolerance_px: float,
     measure: Measure = agreement,
 ) -> tuple[Voter, list[str]]:
-    """A photo's mask from its clicks and the others' votes; and the clicks left out as they contradict it."""
-    known, view = known_pixels(photos, k, others), photos.views[k]
-    clicks, notes = _without_the_harmful(segment, view, known, clicks, tolerance_px, measure)
-    keep = np.ones(len(clicks.pixels), dtype=bool)
-    voter = voter_of(photos, k, np.zeros((view.height, view.width), dtype=bool), 0.0, 0.0, NO_CLICKS)
-    for _ in range(2):
-        kept = clicks.only(keep)
-        if len(known.known) < MIN_KNOWN_POINTS and not kept.prompt:
-            break
-        made = best_mask(segment, view, _prompts(known, kept), kept.box, tolerance_px, measure)
-        voter = voter_of(photos, k, *made, kept)
-        wrong = keep & ~_held_clicks(voter.mask, clicks, tolerance_px)
-        if not wrong.any():
-            break
-        x, y = pixel_of(clicks.pixels, voter.mask)
-        miss = np.where(clicks.inside, distance_to(voter.mask)[y, x], distance_to(~voter.mask)[y, x])
-        notes += [
-            f"{clicks.named(int(row))} in {view.name} is {miss[row]:.0f} px on the wrong side of its mask's outline"
-            for row in np.flatnonzero(wrong)
-        ]
-        keep &= ~wrong
-    return voter, notes
+    """A photo's mask from its clicks and the others' votes; and the clicks left out as they contradict it.
 
-
-def _prompts(known: Prompts, clicks: PhotoClicks) -> Prompts:
-    return known._replace(clicked=clicks.on, clicked_off=np.concatenate([clicks.off, known.clicked_off]))
-
-
-def _without_the_harmful(
-    segment: Segmenter, view: View, known: Prompts, clicks: PhotoClicks, tolerance_px: float, measure: Measure
-) -> tuple[PhotoClicks, list[str]]:
-    """The clicks of a photo without a box or a last click that makes its mask worse, and a sentence on that.
-
-    The others are enough without it, and their mask agrees with more of all clicks; or, without a box, with as many,
-    and SAM 2 thinks more of it.
+    Three clicks inside, and those before them, prompt it together. A further one has it made again, with all clicks so
+    far, where the mask does not hold it, and counts if the new mask holds more of these: it never spoils a mask that
+    agrees with it.
     """
-    last = len(clicks.pixels) - 1
-    tries = {"": clicks, "the box": replace(clicks, box=None)}
-    if last >= 0:
-        tries[clicks.named(last)] = clicks.only(np.arange(last + 1) < last)
-    tries = {
-        what: some for what, some in tries.items() if some.enough and (what != "the box" or clicks.box is not None)
-    }
-    ranks: dict[str, tuple[float, float]] = {}
-    for what, some in tries.items() if len(tries) > 1 else ():
-        mask, quality, _ = best_mask(segment, view, _prompts(known, some), some.box, tolerance_px, measure)
-        share = agreement(mask, Prompts(clicks.on, clicks.off), tolerance_px)
-        # Fewer clicks prompt a mask that is surer of less.
-        ranks[what] = share, quality if what in ("", "the box") else ranks[""][1]
-    best = max(ranks, key=lambda what: ranks[what], default="")
-    if not best:
-        return clicks, []
-    (share, quality), (share_now, quality_now) = ranks[best], ranks[""]
-    note = (
-        f"{best} in {view.name}: without it the mask agrees with {share:.2f} of the clicks, at a quality of"
-        f" {quality:.2f}; with it {share_now:.2f}, at {quality_now:.2f}"
-    )
-    return tries[best], [note]
+    known, view = known_pixels(photos, k, others), photos.views[k]
+    notes: list[str] = []
+
+    def mask_from(some: PhotoClicks) -> tuple[tuple[Mask, float, float], NDArray[np.bool_]]:
+        made = np.zeros((view.height, view.width), dtype=bool), 0.0, 0.0
+        if len(known.known) >= MIN_KNOWN_POINTS or some.prompt:
+            prompts = known._replace(clicked=some.on, clicked_off=np.concatenate([some.off, known.clicked_off]))
+            made = best_mask(segment, view, prompts, some.box, tolerance_px, measure)
+        return made, _held_clicks(made[0], clicks, tolerance_px)
+
+    used = np.asarray(np.cumsum(clicks.inside) - clicks.inside < SUFFICIENT_CLICKS)
+    made, holds = mask_from(clicks.only(used))
+    without = replace(clicks, box=None)
+    if clicks.box is not None and without.enough and not holds.all():
+        other, its = mask_from(without.only(used))
+        if its.sum() > holds.sum():
+            made, holds, clicks = other, its, without
+            notes.append(f"the box in {view.name}: without it the mask holds more of the clicks")
+    for row in np.flatnonzero(~used).tolist():
+        used[row] = True
+        if not holds[row]:
+            other, its = mask_from(clicks.only(used))
+            if its[: row + 1].sum() > holds[: row + 1].sum():
+                made, holds = other, its
+            else:
+                used[row] = False
+    if (used & ~holds).any():
+        other, its = mask_from(clicks.only(used & holds))
+        if its.sum() >= holds.sum():
+            made, holds = other, its
+    x, y = pixel_of(clicks.pixels, made[0])
+    miss = np.where(clicks.inside, distance_to(made[0])[y, x], distance_to(~made[0])[y, x])
+    notes += [
+        f"{clicks.named(row)} in {view.name} is {miss[row]:.0f} px on the wrong side of its mask's outline"
+        for row in np.flatnonzero(~holds).tolist()
+    ]
+    return voter_of(photos, k, *made, clicks.only(holds)), notes
 
 
 def _held_clicks(mask: Mask, clicks: PhotoClicks, tolerance_px: float) -> NDArray[np.bool_]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError, sha256
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask, mask_iou
-from scenefuse.marks.photo_clicks import PhotoClicks
+from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks
 from scenefuse.masks.grabcut import cleaned
 from scenefuse.masks.prompts import BOX_GROWTH_SHARE, NO_PIXELS, Prompts, far_apart
 from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256, why_unavailable
@@ -229,9 +229,11 @@ def query_sam2(network: Sam2, view: View, prompts: Prompts, box: Array | None) -
         network: SAM 2.
         view: the photo, with RGB pixels.
         prompts: all clicks prompt it, and a few of the known points, far apart; of those off the object the near ones.
-        box: (2, 2) corners of a box around it, upper left first, or None.
+        box: (2, 2) corners of a box around it, upper left first, or None. Beside enough clicks it is not used: it says
+            nothing that they do not, and where it is wrong the mask is.
     """
     features, size = network.encode(view.pixels), (view.height, view.width)
+    box = None if len(prompts.clicked) >= SUFFICIENT_CLICKS else box
     inside = prompts.inside
     around = inside if box is None else box
     low, high = around.min(0), around.max(0)

@@ -4,6 +4,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -182,6 +183,8 @@ class Segmenter:
             notes.append("a click lies where other photos can share nothing, as in the sky: click on the object")
         if self.method == "GrabCut" and clicks.box is None and clicks.inside.all():
             notes.append("GrabCut separates colours: click beside the object too, or drag a box around it")
+        if self.method == "SAM 2" and clicks.box is not None and replace(clicks, box=None).enough:
+            notes.append("the box is not used, as the clicks suffice: click outside where the mask is too large")
         share = agreement(mask, Prompts(clicks.on, clicks.off), tolerance_px)
         if share < MIN_AGREEMENT:
             notes.append(f"it agrees with {share:.2f} of the clicks, at least {MIN_AGREEMENT} is needed")
