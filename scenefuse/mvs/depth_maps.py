@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, manifest, quantity, threads, write_json
+from scenefuse.geometry.photo_check import MAX_PHOTOS
 from scenefuse.mvs.dense_cloud import linked_workspace
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.sparse_depths import Reference, select_views
@@ -103,12 +105,14 @@ def _run_plane_sweep(
     workspace: Workspace, references: list[Reference], settings: DepthMapSettings, device: str, folder: Path
 ) -> None:
     """Depth and normal maps by our plane sweep, into folder/depth_maps and folder/normal_maps."""
-    gray: dict[str, View] = {}
+    views = {view.name: view for view in workspace.views}
+
+    @lru_cache(MAX_PHOTOS)
+    def gray(name: str) -> View:
+        return _gray(workspace, views[name], settings.max_image_size_px)
+
     for k, reference in enumerate(references):
-        for view in (reference.view, *reference.sources):
-            if view.name not in gray:
-                gray[view.name] = _gray(workspace, view, settings.max_image_size_px)
-        first, *others = (gray[view.name] for view in (reference.view, *reference.sources))
+        first, *others = (gray(view.name) for view in (reference.view, *reference.sources))
         estimate = estimate_depth(first, others, reference.near, reference.far, settings, device)
         write_depth(folder / "depth_maps" / f"{first.name}.bin", estimate.depth)
         write_normals(folder / "normal_maps" / f"{first.name}.bin", estimate.normals)

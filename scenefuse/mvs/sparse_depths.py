@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import Delaunay, QhullError
 
 from scenefuse.core.stage import StageError
@@ -64,16 +65,16 @@ def select_views(workspace: Workspace, sources: int, min_angle_deg: float) -> di
             "stereo needs two photos and points they share"
         )
     seen = [np.unique(rows) for rows in workspace.seen]
+    rows, ends = np.concatenate(seen), np.cumsum([0, *map(len, seen)])
+    sees = csr_array((np.ones(len(rows), np.int32), rows, ends), shape=(len(seen), len(workspace.points)))
+    shares = csr_array(sees @ sees.T)
     found = {}
     for k, view in enumerate(workspace.views):
-        if len(seen[k]) < MIN_SHARED_POINTS:
-            continue
         worth = []
-        for j, other in enumerate(workspace.views):
-            shared = np.intersect1d(seen[k], seen[j], assume_unique=True) if j != k else np.empty(0)
-            if len(shared) < MIN_SHARED_POINTS:
-                continue
-            value, angle_deg = pair_worth(workspace.points[shared], view.centre, other.centre)
+        row = shares[[k]]
+        for j in np.sort(row.indices[(row.data >= MIN_SHARED_POINTS) & (row.indices != k)]).tolist():
+            shared = np.intersect1d(seen[k], seen[j], assume_unique=True)
+            value, angle_deg = pair_worth(workspace.points[shared], view.centre, workspace.views[j].centre)
             if angle_deg >= min_angle_deg:
                 worth.append((-value, j))
         if worth:
