@@ -165,6 +165,32 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
+def resumed_file(path: Path, *recipe: Any) -> Iterator[Path]:
+    """Yield a file to work in; on success it becomes `path`, and on an error it goes. What a killed process leaves, the
+    next one of the same recipe gets: only for formats that survive a kill, as a database does."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    key = hashlib.sha256(repr(recipe).encode()).hexdigest()[:16]
+    part = path.with_name(f".{path.stem}.part-{key}{path.suffix}")
+
+    def remove(kept: str) -> None:
+        for left in path.parent.glob(f".{path.stem}.part-*"):
+            if not kept or not left.name.startswith(kept):
+                left.unlink(missing_ok=True)
+
+    remove(part.name)
+    try:
+        yield part
+        _sync(part)
+        os.replace(part, path)
+        _sync(path.parent)
+        remove("")
+    except Exception as error:
+        remove("")
+        _find_cause(error, path.parent)
+        raise
+
+
+@contextlib.contextmanager
 def atomic_directory(path: Path) -> Iterator[Path]:
     """Yield an empty temporary directory; on success it is synced and replaces `path`, else it is removed."""
     path = Path(path)

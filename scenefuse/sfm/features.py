@@ -17,7 +17,7 @@ import pycolmap
 from numba import njit
 from numpy.typing import NDArray
 
-from scenefuse.core.stage import StageError, atomic_file, setting, threads
+from scenefuse.core.stage import StageError, resumed_file, setting, threads
 from scenefuse.core.tables import read_lines
 from scenefuse.photos.cameras.given import at_size
 from scenefuse.photos.cameras.read_cameras import camera_of
@@ -77,9 +77,13 @@ def extract_features(
     options.use_gpu = False
     options.sift.max_num_features = settings.max_features
     options.sift.first_octave = settings.first_octave
-    with atomic_file(features) as temporary:
+    recipe = settings, photos.read_text(), calibration and calibration.read_text()
+    with resumed_file(features, *recipe) as temporary:
+        with pycolmap.Database.open(temporary) as opened:
+            camera_of_done = {image.name: image.camera_id for image in opened.read_all_images()}
         for names in groups:
             reader = _reader_options(settings, known, next(p for p in listed if p.name == names[0]))
+            reader.existing_camera_id = next((camera_of_done[n] for n in names if n in camera_of_done), -1)
             cancellable(
                 pycolmap.extract_features,
                 temporary,

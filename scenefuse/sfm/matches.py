@@ -8,8 +8,9 @@ re-matching.
 import contextlib
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
@@ -17,10 +18,21 @@ from typing import Any, Literal
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2, vq
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
-from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, setting, threads, value, write_json
+from scenefuse.core.stage import (
+    StageError,
+    atomic_file,
+    quantity,
+    read_json,
+    resumed_file,
+    setting,
+    threads,
+    value,
+    write_json,
+)
 from scenefuse.photos.geodesy import local_frame
 from scenefuse.photos.photos import Photo, gps_positions, read_photos
 from scenefuse.sfm.colmap import cancellable, require_database
@@ -84,14 +96,21 @@ def match_features(
     """
     require_database(features)
     is_video = value(read_json(photos), "kind") == "video"
-    choice, reason, pairs = choose_pairs(read_photos(photos), is_video, settings)
+    choice, reason, pairs = choose_pairs(read_photos(photos), is_video, settings, partial(alike_pairs, features))
     print(f"{choice} pairs ({reason}): {len(pairs)}", flush=True)
     pycolmap.set_random_seed(seed)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    with atomic_file(database) as temporary:
-        shutil.copyfile(features, temporary)
-        with _pair_list(temporary, pairs) as listed:
+    with pycolmap.Database.open(features) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        counts = [opened.num_keypoints_for_image(number) for number in names]
+    with resumed_file(database, settings, seed, pairs, names, counts) as temporary:
+        if temporary.is_file():
+            print("going on with the pairs that a killed run left", flush=True)
+        else:
+            with atomic_file(temporary) as copy:
+                shutil.copyfile(features, copy)
+        with _pair_list(temporary, names, pairs) as listed:
             cancellable(
                 pycolmap.match_image_pairs,
                 temporary,
@@ -106,12 +125,11 @@ def match_features(
                 error_px = verification.ransac.max_error
                 match_guided(opened, error_px, settings.max_ratio, MAX_DISTANCE)
             _, per_pair = opened.read_two_view_geometry_num_inliers()
-            median = int(np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()]))
         verified, inliers = int(np.count_nonzero(per_pair)), int(np.sum(per_pair))
         if verified == 0:
             advice = "check that they overlap, are sharp and textured"
-            if median < FEW_FEATURES:
-                advice = f"they have {median} features in the median, too few to match: {DULL}"
+            if np.median(counts) < FEW_FEATURES:
+                advice = f"they have {np.median(counts):.0f} features in the median, too few to match: {DULL}"
             raise StageError(f"none of the {len(pairs)} pairs of photos of {photos} show the same thing; {advice}")
     print(f"{verified} of {len(pairs)} pairs verified, {inliers} matches", flush=True)
     content: dict[str, Any] = {
@@ -138,12 +156,11 @@ def _matching(settings: MatchSettings) -> pycolmap.FeatureMatchingOptions:
 
 
 @contextlib.contextmanager
-def _pair_list(database: Path, pairs: list[Pair]) -> Iterator[Path]:
+def _pair_list(database: Path, names: dict[int, str], pairs: list[Pair]) -> Iterator[Path]:
     """A list of pairs as COLMAP reads it. Meanwhile the photos of the database are called by their numbers, since names
     with blanks, or with # in front, are misread."""
     with pycolmap.Database.open(database) as opened:
         images = opened.read_all_images()
-        names = {image.image_id: image.name for image in images}
         _rename(opened, images, {number: str(number) for number in names})
     number_of = {name: number for number, name in names.items()}
     listed = database.with_name(f"{database.name}.pairs.txt")
@@ -159,53 +176,62 @@ def _rename(database: pycolmap.Database, images: list[pycolmap.Image], names: di
         database.update_image(image)
 
 
-def choose_pairs(photos: list[Photo], is_video: bool, settings: MatchSettings) -> tuple[str, str, list[Pair]]:
+def choose_pairs(
+    photos: list[Photo], is_video: bool, settings: MatchSettings, alike: Callable[[int], list[Pair]]
+) -> tuple[str, str, list[Pair]]:
     """The kind of pairs, why, and the pairs themselves, sorted by the photos' order (method M5).
 
     Args:
         photos: in name order.
         is_video: whether they are frames of a video, in order of time.
         settings: see there.
+        alike: pairs of each photo with so many that look alike; called for many photos only.
     """
     names = [p.name for p in photos]
     kind, reason = settings.pairs, "as configured"
     if kind == "auto":
         kind, reason = _automatic(photos, is_video, settings)
+    few, order = len(names) <= settings.exhaustive_up_to, {name: index for index, name in enumerate(names)}
     if kind == "spatial" and not _gps_usable(photos, settings.neighbours):
-        kind, reason = "exhaustive", "pairs are set to spatial, but too few photos have a useful GPS position"
+        kind = "exhaustive" if few else "sequential"
+        reason = "pairs are set to spatial, but too few photos have a useful GPS position"
     if kind == "exhaustive":
-        return kind, reason, list(combinations(names, 2))
-    if kind == "spatial":
-        return kind, reason, spatial_pairs(photos, settings.neighbours)
-    in_time, order = sorted(names, key=_counted), {name: index for index, name in enumerate(names)}
-    pairs = sequential_pairs(in_time, settings.overlap, settings.loop_every)
-    return kind, reason, sorted((_ordered(a, b, order) for a, b in pairs), key=lambda p: (order[p[0]], order[p[1]]))
+        pairs = list(combinations(names, 2))
+    elif kind == "spatial":
+        pairs = spatial_pairs(photos, settings.neighbours)
+        if unknown := {p.name for p in photos if not p.has_gps}:
+            others = combinations(names, 2) if few else alike(settings.neighbours)
+            pairs += [pair for pair in others if not unknown.isdisjoint(pair)]
+    else:
+        loop_every = settings.loop_every if few else len(names)
+        pairs = sequential_pairs(sorted(names, key=_counted), settings.overlap, loop_every)
+        if not few:
+            pairs += alike(settings.neighbours)
+            reason += f", each also with {settings.neighbours} that look alike"
+    unique = {_ordered(a, b, order) for a, b in pairs}
+    return kind, reason, sorted(unique, key=lambda pair: (order[pair[0]], order[pair[1]]))
 
 
 def spatial_pairs(photos: list[Photo], neighbours: int) -> list[Pair]:
-    """Each photo with its nearest ones by GPS, with all photos where its own position is unknown.
+    """Each photo whose position is known with its nearest ones by GPS.
 
     A minimum spanning tree over the positions is added, so that no group of photos stays apart.
     """
-    names = [p.name for p in photos]
-    known, positions = gps_positions(photos)
-    at = {name: row for row, name in enumerate(known)}
-    order = {name: index for index, name in enumerate(names)}
+    names, positions = gps_positions(photos)
     metric = _metric(positions)
-    chosen = {_ordered(a, b, order) for a in names if a not in at for b in names if a != b}
     distance = cdist(metric[:, :2], metric[:, :2])
     # Of photos at one position those next to each other in the order of their names.
-    rows = np.arange(len(known))
+    rows = np.arange(len(names))
     apart = np.abs(rows[:, None] - rows)
     by_ground, by_space = (np.lexsort((apart, d)) for d in (distance, cdist(metric, metric)))
-    for row, name in enumerate(known):
-        others = [c for c in by_ground[row] if c != row][: neighbours // 2]
-        others += [c for c in by_space[row] if c != row and c not in others][: neighbours - len(others)]
-        chosen |= {_ordered(name, known[c], order) for c in others}
     # Coincident positions would be no edge at all in a sparse graph, hence the small constant.
     tree = minimum_spanning_tree(distance + 1e-6).tocoo()
-    chosen |= {_ordered(known[a], known[b], order) for a, b in zip(tree.row, tree.col)}
-    return sorted(chosen, key=lambda pair: (order[pair[0]], order[pair[1]]))
+    chosen = set(zip(tree.row.tolist(), tree.col.tolist()))
+    for row in rows.tolist():
+        others = [c for c in by_ground[row] if c != row][: neighbours // 2]
+        others += [c for c in by_space[row] if c != row and c not in others][: neighbours - len(others)]
+        chosen |= {(row, int(other)) for other in others}
+    return [(names[a], names[b]) for a, b in sorted({(min(pair), max(pair)) for pair in chosen})]
 
 
 def sequential_pairs(names: list[str], overlap: int, loop_every: int) -> list[Pair]:
@@ -214,6 +240,36 @@ def sequential_pairs(names: list[str], overlap: int, loop_every: int) -> list[Pa
     chosen = {(i, j) for i in range(count) for j in range(i + 1, min(i + overlap, count - 1) + 1)}
     chosen |= set(combinations(range(0, count, max(loop_every, 1)), 2))
     return [(names[i], names[j]) for i, j in sorted(chosen)]
+
+
+def alike_pairs(features: Path, count: int) -> list[Pair]:
+    """Each photo of a database with the `count` whose features are most alike, by VLAD (Jégou et al. 2010): one vector
+    a photo, how its descriptors lie about their nearest of a few mean ones."""
+    with pycolmap.Database.open(features) as opened:
+        images = [i for i in opened.read_all_images() if opened.num_descriptors_for_image(i.image_id)]
+
+        def descriptors(image: pycolmap.Image) -> NDArray[np.float32]:
+            return np.asarray(opened.read_descriptors(image.image_id).data, np.float32)
+
+        rng = np.random.default_rng(0)
+        # Half or twice as many means find the same photos.
+        drawn = [rng.permutation(descriptors(image))[:FEW_FEATURES] for image in images]
+        means, _ = kmeans2(np.concatenate(drawn), FEW_FEATURES, minit="++", rng=rng)
+        vectors = np.stack([_vlad(descriptors(image), means) for image in images])
+    vectors -= vectors.mean(0)
+    vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-6)
+    likeness = vectors @ vectors.T
+    np.fill_diagonal(likeness, -np.inf)
+    best = np.argsort(-likeness, axis=1)[:, :count]
+    return [(images[a].name, images[b].name) for a, others in enumerate(best) for b in others]
+
+
+def _vlad(descriptors: NDArray[np.float32], means: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Sums of the differences of (N, D) descriptors to the nearest of (K, D) means, each of length 1, in one row."""
+    nearest = vq(descriptors, means)[0]
+    sums = np.zeros_like(means)
+    np.add.at(sums, nearest, descriptors - means[nearest])
+    return (sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1.0)).ravel()
 
 
 def gps_spread_m(positions: NDArray[np.float64]) -> float:

@@ -22,6 +22,7 @@ from scenefuse.sfm.mapping import MappingSettings, map_photos
 from scenefuse.sfm.matches import (
     MAX_DISTANCE,
     MatchSettings,
+    alike_pairs,
     choose_pairs,
     match_features,
     sequential_pairs,
@@ -46,26 +47,48 @@ def strip(count, step=10.0):
     return [photo(f"{i:03d}.jpg", (i * step, 0.0, 50.0)) for i in range(count)]
 
 
+def chosen(photos, settings, is_video=False, alike=()):
+    """The kind of pairs, why, and the pairs, where `alike` are those that look alike."""
+    return choose_pairs(photos, is_video, settings, lambda count: list(alike))
+
+
 def test_pairs_are_chosen_by_what_is_known():
-    assert choose_pairs(strip(8), False, PAIRS)[0] == "exhaustive"
-    assert choose_pairs(strip(12), False, PAIRS)[0] == "spatial"
-    assert choose_pairs(strip(12, step=0.1), False, PAIRS)[0] == "exhaustive"  # all at one place: GPS says nothing
+    def kind_of(photos, is_video=False):
+        return chosen(photos, PAIRS, is_video)[0]
+
+    assert kind_of(strip(8)) == "exhaustive"
+    assert kind_of(strip(12)) == "spatial"
+    assert kind_of(strip(12, step=0.1)) == "exhaustive"  # all at one place: GPS says nothing
     without = [photo(f"{i:03d}.jpg") for i in range(30)]
-    assert choose_pairs(without[:20], False, PAIRS)[0] == "exhaustive"
-    assert choose_pairs(without[:20], True, PAIRS)[0] == "sequential"
-    assert choose_pairs(without, False, PAIRS)[0] == "sequential"
-    kind, reason, pairs = choose_pairs(without[:5], False, replace(PAIRS, pairs="spatial"))
+    assert kind_of(without[:20]) == "exhaustive"
+    assert kind_of(without[:20], True) == "sequential"
+    assert kind_of(without) == "sequential"
+    kind, reason, pairs = chosen(without[:5], replace(PAIRS, pairs="spatial"))
     assert (kind, len(pairs)) == ("exhaustive", 10) and "too few photos" in reason
 
 
 def test_spatial_pairs_are_neighbours_and_connected():
-    photos = strip(6) + [photo(f"far{i}.jpg", (5000 + 10 * i, 0.0, 50.0)) for i in range(3)] + [photo("no_gps.jpg")]
+    photos = strip(6) + [photo(f"far{i}.jpg", (5000 + 10 * i, 0.0, 50.0)) for i in range(3)]
     pairs = spatial_pairs(photos, 2)
     assert ("000.jpg", "001.jpg") in pairs and ("000.jpg", "002.jpg") in pairs
     assert ("000.jpg", "004.jpg") not in pairs
     assert ("005.jpg", "far0.jpg") in pairs  # the spanning tree
-    assert sum("no_gps.jpg" in pair for pair in pairs) == 9
     assert len(set(pairs)) == len(pairs)
+
+
+def test_photos_without_a_position_are_compared_with_all_or_in_large_sets_with_those_that_look_alike():
+    photos, alike = [*strip(30), photo("no_gps.jpg")], [("no_gps.jpg", "007.jpg"), ("003.jpg", "029.jpg")]
+    few, many = (chosen(photos, replace(PAIRS, exhaustive_up_to=most), alike=alike)[2] for most in (40, 20))
+    assert [sum("no_gps.jpg" in pair for pair in pairs) for pairs in (few, many)] == [30, 1]
+    assert ("007.jpg", "no_gps.jpg") in many and ("003.jpg", "029.jpg") not in many
+    assert set(many) < set(few)
+
+
+def test_a_long_sequence_closes_loops_where_photos_look_alike():
+    photos = [photo(f"{i:03d}.jpg") for i in range(30)]
+    kind, reason, pairs = chosen(photos, PAIRS, alike=[("029.jpg", "003.jpg")])
+    assert kind == "sequential" and "look alike" in reason
+    assert ("003.jpg", "029.jpg") in pairs and len(pairs) == 29 + 28 + 1
 
 
 def test_flights_up_a_facade_and_flights_at_two_heights_hold_together():
@@ -85,10 +108,10 @@ def test_positions_that_a_phone_repeats_do_not_choose_the_pairs():
     """A phone writes its last fix into dozens of photos: all distances among these are 0."""
     repeated = [photo(f"{i:03d}.jpg", (40.0 * (i // 30), 0.0, 50.0)) for i in range(120)]
     settings = MatchSettings()
-    assert choose_pairs(repeated, False, settings)[0] == "exhaustive"
-    assert choose_pairs(repeated, False, replace(settings, exhaustive_up_to=100))[0] == "sequential"
+    assert chosen(repeated, settings)[0] == "exhaustive"
+    assert chosen(repeated, replace(settings, exhaustive_up_to=100))[0] == "sequential"
     hovering = strip(120) + [photo(f"z{i:03d}.jpg", (500.0, 0.0, 50.0)) for i in range(12)]
-    assert choose_pairs(hovering, False, settings)[0] == "spatial"
+    assert chosen(hovering, settings)[0] == "spatial"
     pairs = set(spatial_pairs(hovering, 6))
     assert pairs.issuperset([(f"z{i:03d}.jpg", f"z{i + 1:03d}.jpg") for i in range(11)])
 
@@ -102,7 +125,7 @@ def test_sequential_pairs_close_loops():
 
 def test_photos_counted_without_leading_zeros_are_paired_in_the_order_they_were_taken_in():
     photos = [photo(name) for name in sorted(f"b/IMG_{k}.JPG" for k in range(1, 31))]
-    kind, _, pairs = choose_pairs(photos, False, PAIRS)
+    kind, _, pairs = chosen(photos, PAIRS)
     names = [p.name for p in photos]
     assert kind == "sequential" and pairs == sorted(pairs, key=lambda p: (names.index(p[0]), names.index(p[1])))
     assert all(names.index(a) < names.index(b) for a, b in pairs)
@@ -249,6 +272,60 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
             settings=UndistortSettings(max_size_px=120),
         )
     assert not (tmp_path / "none").exists()
+
+
+def test_features_and_matches_that_a_signal_ended_are_gone_on_with(capture, tmp_path, monkeypatch):
+    folder, _ = capture
+    photos, sizes = folder / "photos.json", []
+
+    def stopped(function, *arguments, **options):
+        """Half of the photos or pairs, then a signal."""
+        if "image_names" in options:
+            options["image_names"] = options["image_names"][:3]
+        else:
+            listed = options["pairing_options"].match_list_path
+            listed.write_text("".join(listed.read_text().splitlines(keepends=True)[:6]))
+        function(*arguments, **options)
+        raise SystemExit(143)
+
+    def run(name):
+        features = tmp_path / f"{name}.features.db"
+        for stage in (
+            lambda: extract_features(folder=folder / "upright", photos=photos, features=features, settings=FEATURES),
+            lambda: match_features(
+                photos=photos, features=features, database=tmp_path / f"{name}.db",
+                matches=tmp_path / f"{name}.json", settings=PAIRS, seed=0,
+            ),
+        ):  # fmt: skip
+            if name == "again":
+                for module in ("features", "matches"):
+                    monkeypatch.setattr(f"scenefuse.sfm.{module}.cancellable", stopped)
+                with pytest.raises(SystemExit):
+                    stage()
+                monkeypatch.undo()
+                sizes.append([p.stat().st_size for p in tmp_path.glob(".again*part-*.db")])
+            stage()
+        with pycolmap.Database.open(tmp_path / f"{name}.db") as opened:
+            counts = [opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()]
+            return len(opened.read_all_cameras()), counts, inliers_of(tmp_path / f"{name}.db")
+
+    assert run("once") == run("again")
+    assert all(len(kept) == 1 for kept in sizes) and not list(tmp_path.glob(".*"))
+
+
+def test_photos_that_look_alike_are_found_by_their_features(tmp_path):
+    rng = np.random.default_rng(0)
+    places = rng.integers(0, 256, (5, 40, 128))
+    with pycolmap.Database.open(tmp_path / "features.db") as database:
+        camera = database.write_camera(
+            pycolmap.Camera(model="SIMPLE_RADIAL", width=64, height=64, params=[50, 32, 32, 0])
+        )
+        for k in range(15):
+            image = database.write_image(pycolmap.Image(name=f"{k:02d}.jpg", camera_id=camera))
+            noisy = np.clip(places[k % 5] + rng.normal(0, 20, (40, 128)), 0, 255).astype(np.uint8)
+            database.write_descriptors(image, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, noisy))
+    found = alike_pairs(tmp_path / "features.db", 2)
+    assert len(found) == 30 and all(int(a[:2]) % 5 == int(b[:2]) % 5 for a, b in found)
 
 
 def test_guided_matches_are_those_of_colmap(capture, tmp_path):
