@@ -22,8 +22,9 @@ from scenefuse.core.transforms import FIXING_POINTS
 
 # He et al. 2026: iterations of a global bundle adjustment, and of the linear solver within one.
 ITERATIONS, LINEAR_SOLVER_ITERATIONS = 100, 200
-# Relative gain that ends an adjustment which only compares or repeats.
-ROUGH_TOLERANCE = 1e-6
+# Relative gain that ends an adjustment. All iterations take three times as long and move cameras by a hundredth of
+# their errors.
+ADJUSTMENT_TOLERANCE = 1e-6
 # Observations with a larger error are dropped, as COLMAP's mapper does.
 MAX_REPROJECTION_ERROR_PX = pycolmap.IncrementalMapperOptions().filter_max_reproj_error
 # The smallest model that has a shape.
@@ -51,13 +52,13 @@ class Freedom:
     principal_point: bool = False
 
 
-def adjust(model: pycolmap.Reconstruction, freedom: Freedom, tolerance: float = 0.0) -> None:
+def adjust(model: pycolmap.Reconstruction, freedom: Freedom) -> None:
     """Adjust poses, points and the free part of the lenses of a model in place, by Cauchy-weighted errors."""
-    cancellable(pycolmap.bundle_adjustment, model, adjustment_options(freedom, tolerance))
+    cancellable(pycolmap.bundle_adjustment, model, adjustment_options(freedom))
 
 
-def adjustment_options(freedom: Freedom, tolerance: float = 0.0) -> pycolmap.BundleAdjustmentOptions:
-    """COLMAP's options of an adjustment; a relative gain of 0 ends none before its iterations do (He et al. 2026)."""
+def adjustment_options(freedom: Freedom, tolerance: float = ADJUSTMENT_TOLERANCE) -> pycolmap.BundleAdjustmentOptions:
+    """COLMAP's options of an adjustment; `tolerance`: the relative gain that ends it."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = options.refine_extra_params = freedom.lens

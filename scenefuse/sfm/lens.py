@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 
 from scenefuse.core.transforms import Array
-from scenefuse.sfm.colmap import MAX_REPROJECTION_ERROR_PX, MIN_PHOTOS, ROBUST_PX, ROUGH_TOLERANCE, Freedom, adjust
+from scenefuse.sfm.colmap import MAX_REPROJECTION_ERROR_PX, MIN_PHOTOS, ROBUST_PX, Freedom, adjust
 
 # A richer lens has to predict held-out observations better by so many standard errors.
 MIN_GAIN = 3.0
@@ -49,13 +49,13 @@ class Lens:
     freedom: Freedom
     words: str
 
-    def fit(self, model: pycolmap.Reconstruction, tolerance: float = 0.0) -> pycolmap.Reconstruction:
+    def fit(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         """A copy of a model, adjusted with this lens."""
         fitted = copy.deepcopy(model)
         for camera in fitted.cameras.values():
             if self.richest is not None:
                 enrich(camera, self.richest)
-        adjust(fitted, self.freedom, tolerance)
+        adjust(fitted, self.freedom)
         return fitted
 
 
@@ -90,12 +90,12 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
     """
     kept, held = hold_out(model)
     best, beyond = lenses[0], None
-    start = best.fit(kept, ROUGH_TOLERANCE)
+    start = best.fit(kept)
     poorer = [_errors(start, held)]
     for lens in lenses[1:]:
         if lens is RADIAL and any(camera.model_name not in ONE_TERM for camera in model.cameras.values()):
             continue
-        fitted = lens.fit(start, ROUGH_TOLERANCE)
+        fitted = lens.fit(start)
         errors = _errors(fitted, held)
         gain = min(_gain(others, errors) for others in poorer)
         median = min(np.median(others) for others in poorer) if held else 0.0

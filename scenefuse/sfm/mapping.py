@@ -1,6 +1,6 @@
 """Incremental mapping with COLMAP, the second half of structure from motion; the same code serves scenes and objects.
 
-He et al. 2026, section on the scene: bundle adjustment with 100 iterations, 200 of the linear solver, zero tolerances.
+He et al. 2026, section on the scene: bundle adjustment with 100 iterations, 200 of the linear solver.
 """
 
 import contextlib
@@ -28,9 +28,9 @@ from scenefuse.photos.cameras.read_cameras import place_of
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.photos import orientations_in, read_photos
 from scenefuse.sfm.colmap import (
+    ADJUSTMENT_TOLERANCE,
     ITERATIONS,
     MIN_PHOTOS,
-    ROUGH_TOLERANCE,
     STRONG_PAIR,
     cancellable,
     doubtful_photos,
@@ -268,14 +268,14 @@ def _with_lens(
     The first model's points are triangulated again, for a poorer lens splits tracks and drops matches. It may also have
     left photos out, or put them at wrong places, where an adjustment leaves them: then photos are mapped again.
     """
-    model = lens.fit(ranked[0], ROUGH_TOLERANCE)
+    model = lens.fit(ranked[0])
     found = explained_matches(model, job.database)
     with _calibrated(model, job) as database:
         if model.num_reg_images() == len(job.names) and not doubtful_photos(model, found):
             folders = job.folder, database.parent
             return [cancellable(pycolmap.triangulate_points, model, database, *folders, options=options)], 1
         again = _models(job, options, database)
-    if again and _explained(lens.fit(again[0], ROUGH_TOLERANCE), job) > found.total:
+    if again and _explained(lens.fit(again[0]), job) > found.total:
         return again, 2
     return [model, *ranked[1:]], 1
 
@@ -328,7 +328,7 @@ def _mapper_options(
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
     options.ba_global_max_num_iterations = ITERATIONS
-    options.ba_global_function_tolerance = options.ba_local_function_tolerance = ROUGH_TOLERANCE
+    options.ba_global_function_tolerance = options.ba_local_function_tolerance = ADJUSTMENT_TOLERANCE
     options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_GROWTH
     options.min_model_size = MIN_PHOTOS
     if calibrated:

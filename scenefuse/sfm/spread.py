@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.photos.workspace import read_model
-from scenefuse.sfm.colmap import MIN_PHOTOS, ROUGH_TOLERANCE, adjust
+from scenefuse.sfm.colmap import MIN_PHOTOS, adjust
 from scenefuse.sfm.lens import LENSES, MAX_POINTS, Lens
 
 # Groups of photos, each left out once.
@@ -107,11 +107,11 @@ def spread_of(model: pycolmap.Reconstruction, lens: Lens, beyond: Lens | None) -
         fewer = copy.deepcopy(model)
         for _, image in names[group::groups]:
             fewer.deregister_frame(fewer.images[image].frame_id)
-        adjust(fewer, lens.freedom, ROUGH_TOLERANCE)
+        adjust(fewer, lens.freedom)
         if (found := _moved(fewer, model, ids)) is not None:
             moved.append(found)
             whole.append(False)
-    if beyond is not None and (found := _moved(beyond.fit(model, ROUGH_TOLERANCE), model, ids)) is not None:
+    if beyond is not None and (found := _moved(beyond.fit(model), model, ids)) is not None:
         moved.append(found)
         whole.append(True)
     kept = np.array(moved).reshape(-1, len(ids), 3)

@@ -23,7 +23,7 @@ from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.register.align_models import MAX_ERROR_PX, AlignmentSettings, align_landmarks
 from scenefuse.register.landmarks import match_landmarks
 from scenefuse.register.reprojection import match_errors, observations
-from scenefuse.sfm.colmap import ROUGH_TOLERANCE, Freedom, adjustment_options, drop_outliers
+from scenefuse.sfm.colmap import Freedom, adjustment_options, drop_outliers
 
 # Ids of the object's camera, photos and points in the joint model lie so far above those of the scene's.
 ABOVE = 1_000_000
@@ -118,7 +118,7 @@ def adjust_jointly(model: pycolmap.Reconstruction, freedom: Freedom, held: bool)
         for camera in model.cameras:
             if held and camera < ABOVE:
                 config.set_constant_cam_intrinsics(camera)
-        options = adjustment_options(freedom, ROUGH_TOLERANCE)
+        options = adjustment_options(freedom)
         pycolmap.create_default_bundle_adjuster(options, config, model).solve()
         drop_outliers(model)
 

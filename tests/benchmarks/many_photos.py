@@ -16,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -78,6 +79,11 @@ json.dump({"seconds": used.ru_utime + used.ru_stime, "memory_mb": int(peak[1]) /
 """
 
 
+def _shifted(height: world.Height, at: Array, x: Array, y: Array) -> Array:
+    """Heights of the ground about another middle."""
+    return height(x + at[0], y + at[1])
+
+
 def large_world() -> world.World:
     """The demo's terrain without the hills around it, its clutter again in every tile, its objects in the middle."""
     models = {name: make() for name, make in OBJECTS.items()}
@@ -98,9 +104,8 @@ def large_world() -> world.World:
         for row in range(-TILES, TILES + 1):
             at, middle = np.array([2 * TILE_M[0] * column, 2 * TILE_M[1] * row]), column == row == 0
             rng = np.random.default_rng([SEED, column + TILES, row + TILES])
-            clutter = world._clutter(
-                lambda x, y, at=at: height(x + at[0], y + at[1]), centres if middle else centres + 1e4, radii, rng
-            )
+            around = partial(_shifted, height, at)
+            clutter = world._clutter(around, centres if middle else centres + 1e4, radii, rng)
             inside = [p for p in clutter if (np.abs(p.vertices[:, :2].mean(0)) < TILE_M).all()]
             parts += [(p.moved((at[0], at[1], 0.0)), 0) for p in inside]
     frames = [(0.0, 0.0, 0.0, 1.0, 0.0)]
@@ -116,7 +121,7 @@ def strips(side: int) -> Cameras:
     """A square flight to and fro, as the demo's; some photos look ahead."""
     body, rng = bodies.FLIGHT["real"], np.random.default_rng([SEED, 1])
     along = (np.arange(side) - (side - 1) / 2) * STEP_M
-    rotations, centres = [], []
+    rotations, centres = list[Array](), list[Array]()
     for k, x in enumerate(along):
         forth = 1.0 if k % 2 == 0 else -1.0
         for y in along[:: int(forth)]:
@@ -190,7 +195,10 @@ def plant(folder: Path, photos: int) -> Cameras:
     write_json(folder / "cameras.json", cameras_json(cameras))
     focal = float(cameras.intrinsics[0, 0])
     size = cameras.width, cameras.height
-    listed = [Photo(name, *size, "", *map(float, g), focal) for name, g in zip(cameras.names, gps)]
+    listed = [
+        Photo(name, *size, "", latitude_deg=g[0], longitude_deg=g[1], altitude_m=g[2], focal_px=focal)
+        for name, g in zip(cameras.names, gps.tolist())
+    ]
     write_photos(folder / "photos.json", listed, folder, "photos", [])
     pairs = spatial_pairs(listed, MatchSettings().neighbours)
     quantities = {"pairs": quantity(len(pairs), "1"), "pairs_choice": quantity("spatial", "")}
@@ -371,8 +379,10 @@ def map_otherwise(
 ) -> None:
     """`map_photos` with another mapper."""
     mapping._models = mapped_otherwise(mapper)
-    files = {"folder": folder, "photos": photos, "database": database, "sparse": sparse, "report": report}
-    mapping.map_photos(**files, settings=mapping.MappingSettings(), seed=seed)
+    mapping.map_photos(
+        folder=folder, photos=photos, database=database, sparse=sparse, report=report,
+        settings=mapping.MappingSettings(), seed=seed,
+    )  # fmt: skip
 
 
 def many_photos(

@@ -21,7 +21,7 @@ from support.photographed_place import (
 
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.register.landmarks import Landmarks, landmarks_of
-from scenefuse.sfm.colmap import ROUGH_TOLERANCE, adjust, drop_outliers
+from scenefuse.sfm.colmap import adjust, drop_outliers
 from scenefuse.sfm.lens import HELD, Choice, choose_lens
 
 OUTLIERS = 0.05
@@ -255,14 +255,14 @@ def mapped(side: Side) -> None:
     options.print_summary = False
     pycolmap.bundle_adjustment(side.model, options)
     drop_outliers(side.model)
-    adjust(side.model, HELD.freedom, ROUGH_TOLERANCE)
+    adjust(side.model, HELD.freedom)
     drop_outliers(side.model)
 
 
 def calibrated(side: Side) -> Choice:
     """Choose the lens of a mapped side as mapping does, and adjust its model with it."""
     choice = choose_lens(side.model)
-    side.model = choice.lens.fit(side.model, ROUGH_TOLERANCE)
+    side.model = choice.lens.fit(side.model)
     drop_outliers(side.model)
     return choice
 

@@ -14,7 +14,7 @@ from scenefuse.photos.cameras.given import Place
 from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo, write_photos
 from scenefuse.photos.workspace import View
-from scenefuse.sfm.colmap import ROUGH_TOLERANCE, adjust
+from scenefuse.sfm.colmap import adjust
 from scenefuse.sfm.lens import HELD
 
 FRAME = LocalFrame(47.37, 8.55, 430.0)
@@ -83,7 +83,7 @@ class Flight:
         for place, track in zip(self.ground, tracks):
             if track.length() > 1:
                 model.add_point3D(place, track)
-        adjust(model, HELD.freedom, ROUGH_TOLERANCE)
+        adjust(model, HELD.freedom)
         t = MODEL_FROM_LOCAL
         model.transform(pycolmap.Sim3d(t.scale, pycolmap.Rotation3d(t.rotation), t.translation))
         return model

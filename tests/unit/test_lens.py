@@ -10,7 +10,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3
 from scenefuse.register.uncertainty import Uncertainty, with_bending
 from scenefuse.sfm import spread as bundle
-from scenefuse.sfm.colmap import ROUGH_TOLERANCE, adjust
+from scenefuse.sfm.colmap import adjust
 from scenefuse.sfm.features import read_calibration
 from scenefuse.sfm.lens import BROWN, CENTRED, HELD, RADIAL, choose_lens, enrich
 from scenefuse.sfm.spread import Spread, read_spread, spread_of, write_spread
@@ -30,7 +30,7 @@ def photographed(camera: list[float], noise_px: float = 0.3) -> pycolmap.Reconst
     pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=noise_px), model)
     for found in model.cameras.values():
         found.model, found.params = pycolmap.CameraModelId.SIMPLE_RADIAL, MIDDLE
-    adjust(model, HELD.freedom, ROUGH_TOLERANCE)
+    adjust(model, HELD.freedom)
     return model
 
 
@@ -38,7 +38,7 @@ def test_a_principal_point_off_the_middle_is_refined_and_found():
     model = photographed([700, 700, 510, 388, 0, 0, 0, 0])
     before = copy.deepcopy(model)
     lens, beyond = choose_lens(model)
-    camera = next(iter(lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
+    camera = next(iter(lens.fit(model).cameras.values()))
     assert (lens, beyond) == (CENTRED, BROWN)
     assert abs(camera.principal_point_x - 510) < 1 and abs(camera.principal_point_y - 388) < 1
     assert list(model.cameras[1].params) == list(before.cameras[1].params), "the model itself was changed"
@@ -48,7 +48,7 @@ def test_brown_distortion_is_refined_and_found():
     true = [700, 700, 510, 388, -0.3, 0.5, 0.02, -0.015]
     model = photographed(true)
     lens, beyond = choose_lens(model)
-    camera = next(iter(lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
+    camera = next(iter(lens.fit(model).cameras.values()))
     assert lens == BROWN
     rays = np.array([[x, y, 1.0] for x in (-0.2, 0, 0.2) for y in (-0.2, 0, 0.2)])
     expected = pycolmap.Camera(model="OPENCV", width=1000, height=800, params=true).img_from_cam(rays)
@@ -60,7 +60,7 @@ def test_two_radial_terms_are_found_without_tangential_ones():
     model = photographed([700, 700, 510, 388, -0.5, 30, 0, 0])
     lens, beyond = choose_lens(model)
     assert (lens, beyond) == (RADIAL, BROWN)
-    camera = next(iter(lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
+    camera = next(iter(lens.fit(model).cameras.values()))
     assert camera.model_name == "RADIAL" and abs(camera.principal_point_x - 510) < 1
 
 
@@ -89,7 +89,7 @@ def test_a_richer_model_is_the_same_lens():
 def test_the_spread_covers_a_wrong_lens_and_survives_a_file(tmp_path):
     model = photographed([700, 700, 510, 388, 0, 0, 0, 0])
     held = spread_of(model, HELD, CENTRED)
-    refined = spread_of(CENTRED.fit(model, ROUGH_TOLERANCE), CENTRED, None)
+    refined = spread_of(CENTRED.fit(model), CENTRED, None)
     place = np.median(held.points, axis=0)
     assert np.trace(held.covariance_at(place)) > 10 * np.trace(refined.covariance_at(place))
     write_spread(tmp_path / "spread.npz", held)
@@ -102,7 +102,7 @@ def test_the_spread_covers_a_wrong_lens_and_survives_a_file(tmp_path):
 
 @pytest.mark.parametrize("few", ["three photos", "on one line"])
 def test_photos_of_which_none_can_be_left_out_do_not_say_how_far_their_model_may_be_bent(few, monkeypatch):
-    monkeypatch.setattr(bundle, "adjust", lambda model, freedom, tolerance: None)
+    monkeypatch.setattr(bundle, "adjust", lambda model, freedom: None)
     model = photographed([700, 700, 500, 400, 0, 0, 0, 0])
     for place, image in enumerate(sorted(model.reg_image_ids())):
         frame = model.frame(model.images[image].frame_id)
