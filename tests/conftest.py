@@ -1,6 +1,7 @@
 """Options of the test run: `--part masks` selects the files of tests that reach a part of the library."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -34,3 +35,11 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if not home.is_dir():
         raise pytest.UsageError(f"PART={part}: there is no package scenefuse/{part}")
     return True if not any(path.is_relative_to(home) for path in reached(collection_path, ROOT)) else None
+
+
+@pytest.fixture(autouse=True, scope="session")
+def unsynced() -> Iterator[None]:
+    """Files are written without waiting for the disk: no power cut comes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: None)
+        yield
