@@ -20,13 +20,7 @@ from scenefuse.core.stage import atomic_directory, quantity, setting, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.monodepth import DepthNetwork, sample
-from scenefuse.nerf.prior_inputs import (
-    STEREO,
-    DepthPhotos,
-    crop_to_object,
-    depth_photos,
-    network_inputs,
-)
+from scenefuse.nerf.prior_inputs import STEREO, DepthPhotos, crop_to_object, depth_photos, network_inputs
 from scenefuse.nerf.prior_training import Recipe, loss_quantities, predict, prepare_torch, train_network
 from scenefuse.nerf.rendered_maps import MAP_AGREEMENT, confirm, write_prior
 from scenefuse.photos.views import load_views

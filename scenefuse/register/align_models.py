@@ -20,13 +20,7 @@ from scenefuse.georef.placement import PHOTOS_OF_ONE_ERROR, GeoreferenceSettings
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.photos import gps_accuracies, gps_positions, read_photos
 from scenefuse.register.landmarks import Landmarks, match_landmarks, read_landmarks
-from scenefuse.register.reprojection import (
-    Observations,
-    bootstrap,
-    match_errors,
-    minimise_reprojection,
-    observations,
-)
+from scenefuse.register.reprojection import Observations, bootstrap, match_errors, minimise_reprojection, observations
 from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities
 from scenefuse.sfm.gravity import estimate_up
 
@@ -188,11 +182,15 @@ def find_consensus(seen: Observations, seed: int) -> Consensus | None:
     pose = _most_supported(seen, seed)
     if pose is None:
         return None
-    error = match_errors(seen, pose)
-    others = seen.subset(error > 3 * MAX_ERROR_PX)
-    other = _most_supported(others, seed)
-    rival = 0 if other is None else int((match_errors(others, other) <= MAX_ERROR_PX).sum())
-    return Consensus(pose, error <= MAX_ERROR_PX, rival, other)
+    other, rival = _another(seen, [pose], seed)
+    return Consensus(pose, match_errors(seen, pose) <= MAX_ERROR_PX, rival, other)
+
+
+def _another(seen: Observations, poses: list[Sim3], seed: int) -> tuple[Sim3 | None, int]:
+    """The similarity that most matches support of those which no pose explains, and how many do."""
+    rest = seen.subset(np.min([match_errors(seen, pose) for pose in poses], axis=0) > 3 * MAX_ERROR_PX)
+    other = _most_supported(rest, seed)
+    return other, 0 if other is None else int((match_errors(rest, other) <= MAX_ERROR_PX).sum())
 
 
 def _by_gps(seen: Observations, consensus: Consensus, gps: GpsPose, at: Array, seed: int) -> Consensus:
@@ -202,9 +200,7 @@ def _by_gps(seen: Observations, consensus: Consensus, gps: GpsPose, at: Array, s
     other, rival = consensus.other, consensus.rival
     while other is not None and rival > least and len(poses) < most:
         poses.append(other)
-        rest = seen.subset(np.min([match_errors(seen, pose) for pose in poses], axis=0) > 3 * MAX_ERROR_PX)
-        other = _most_supported(rest, seed)
-        rival = 0 if other is None else int((match_errors(rest, other) <= MAX_ERROR_PX).sum())
+        other, rival = _another(seen, poses, seed)
     allowed = [pose for pose in poses if gps.miss(pose, at) <= MAX_DEVIATIONS]
     if len(poses) == 1 or len(allowed) != 1 or len(poses) == most:
         return consensus

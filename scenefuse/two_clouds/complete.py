@@ -24,14 +24,7 @@ from scenefuse.core.version import VERSION
 from scenefuse.fuse.fuse_object import possible
 from scenefuse.fuse.measure import unchecked
 from scenefuse.fuse.modes import NEAR, FusionSettings, color_notes, fuse_by_distance
-from scenefuse.fuse.write import (
-    Changes,
-    Source,
-    together,
-    was_completed,
-    with_source,
-    write_completed,
-)
+from scenefuse.fuse.write import Changes, Source, together, was_completed, with_source, write_completed
 
 FILES = ("completed.ply", "completed.laz", "completed.json")
 # Integers of a LAS file's coordinates, and the greatest of them.

@@ -1,6 +1,7 @@
 """A painted plane z = 0 photographed from above, for checks of points in photos; rays and colours are exact."""
 
 from functools import cache
+from math import cos, sin
 
 import cv2
 import numpy as np
@@ -16,10 +17,11 @@ PANEL = 0.15
 def paint(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Grey values 0..255 of places on the plane: smooth noise of several wavelengths, none beyond x = BLANK."""
     rng = np.random.default_rng(3)
+    x, y = x.astype(np.float32), y.astype(np.float32)
     grey = np.zeros_like(x)
     for _ in range(40):
         angle, wavelength, phase = rng.uniform(0, np.pi), rng.uniform(0.12, 0.8), rng.uniform(0, 6.3)
-        grey += np.sin((x * np.cos(angle) + y * np.sin(angle)) * 2 * np.pi / wavelength + phase)
+        grey += np.sin((x * cos(angle) + y * sin(angle)) * 2 * np.pi / wavelength + phase)
     return np.where(x > BLANK, 128.0, np.clip(128 + 12 * grey, 0, 255))
 
 
@@ -58,7 +60,7 @@ def _photographs(
         if panel is not None:
             before = centre + rays * ((panel - centre[2]) / rays[..., 2:])
             on_panel = (np.abs(before[..., :2]) <= PANEL).all(-1)
-            seen = np.where(on_panel, paint(before[..., 1] - 3, before[..., 0] - 7), seen)
+            seen[on_panel] = paint(before[on_panel, 1] - 3, before[on_panel, 0] - 7)
         grey = cv2.resize(np.where(rays[..., 2] < 0, seen, 255.0), (size, size), interpolation=cv2.INTER_AREA)
         pixels = np.clip(np.rint(grey + rng.normal(0, noise, grey.shape)), 0, 255).astype(np.uint8)
         views.append(View(f"{k}.png", intrinsics, pose, size, size, pixels))

@@ -10,10 +10,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate
 from scenefuse.core.stage import value
 from scenefuse.core.transforms import Sim3
 from scenefuse.fuse import compare, modes
-from scenefuse.fuse.compare import (
-    Reason,
-    better_measured,
-)
+from scenefuse.fuse.compare import Reason, better_measured
 from scenefuse.fuse.fuse_object import evidence_report
 from scenefuse.fuse.measure import FIELDS, Evidence, Measured, deviations_of_pose
 from scenefuse.fuse.modes import FusionSettings, check, fuse_by_evidence
@@ -61,15 +58,13 @@ def test_the_sharper_side_stays_where_both_measured(near, far):
 
 
 def test_a_rough_object_does_not_take_the_place_of_a_smooth_scene(near, far):
-    rough, smooth = sheet(-0.8, 0.8, 0.015, noise=0.012), sheet(-0.8, 0.8, 0.02)
+    rough, smooth = sheet(-0.4, 0.4, 0.015, noise=0.012), sheet(-0.4, 0.4, 0.02)
+    of_rough, of_smooth = (np.abs(cloud.points[:, 0]) < 0.3 for cloud in (rough, smooth))
     found = check(rough, smooth, near, far, nerf_only=False)
-    inside = np.abs(smooth.points[:, 0]) < 0.6
-    assert (found.reason[inside] == Reason.KEPT).mean() > 0.95 and found.added[
-        np.abs(rough.points[:, 0]) < 0.6
-    ].mean() < 0.02
+    assert (found.reason[of_smooth] == Reason.KEPT).mean() > 0.95 and found.added[of_rough].mean() < 0.02
     # A rough scene gives way to a smooth object.
     found = check(smooth, rough, near, far, nerf_only=False)
-    assert (found.reason[np.abs(rough.points[:, 0]) < 0.6] != Reason.KEPT).mean() > 0.95 and found.added.mean() > 0.95
+    assert (found.reason[of_rough] != Reason.KEPT).mean() > 0.95 and found.added.mean() > 0.95
 
 
 def test_ground_beside_an_object_stays_where_photos_confirm_it(near, far):

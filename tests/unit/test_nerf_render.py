@@ -5,14 +5,7 @@ import math
 import pytest
 import torch
 
-from scenefuse.nerf.render import (
-    Occupancy,
-    RayPrior,
-    composite,
-    march,
-    march_reference,
-    median_distance,
-)
+from scenefuse.nerf.render import Occupancy, RayPrior, composite, march, march_reference, median_distance
 
 
 def _no_prior(rays):

@@ -4,15 +4,7 @@ import pytest
 
 from scenefuse.core.stage import StageError
 from scenefuse.marks.clicks import Click, label_name
-from scenefuse.pick.document import (
-    point_name,
-    problems,
-    with_box,
-    with_label,
-    with_length,
-    with_point,
-    without_nearest,
-)
+from scenefuse.pick.document import point_name, problems, with_box, with_label, with_length, with_point, without_nearest
 
 SIZES = {"a.jpg": (100, 50), "Füße 2.jpg": (100, 50)}
 HEAD = Click("inside", "a.jpg", 10, 20)
