@@ -1,12 +1,13 @@
 """Photo-consistency: how well a depth per pixel of one photo matches the other photos; in Numba on a CPU, else PyTorch.
 
-On a CPU a band of rows is warped, summed over windows and compared row by row, so that everything but the photos stays
-in the cache. What a pixel gets does not depend on bands or threads.
+On a CPU a tile of the reference is compared with all sources at all hypotheses before the next one, so that everything
+stays in the cache. What a pixel gets does not depend on tiles or threads.
 
 Source: Goesele et al. 2006 (the best K of several views are averaged, which leaves occluded ones out).
 """
 
 import math
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -25,6 +26,8 @@ GREY_FALL = 0.07
 DISTANCE_FALL = 0.6
 # Score of a hypothesis outside a source photo: worse than a window that does not match.
 OUTSIDE_SCORE = -0.5
+# Pixels of a tile along a row, with the halo of its windows.
+TILE = 128
 _MATH = {"contract", "reassoc", "nsz"}
 
 
@@ -37,6 +40,8 @@ class Matcher:
         weights: (2, h, window, w) of the pixels in a window, see `support_weights`.
         windows: (3, h, w) reference, mean and variance.
         best: sources that count.
+        sources: of each the photo (1, 1, H, W) without its mean, and float32 (3, 3) and (3,) that take a pixel of the
+            reference and its inverse depth into the source photo, whose sides are -1..1.
     """
 
     def __init__(
@@ -47,12 +52,8 @@ class Matcher:
         window_px: int,
         device: torch.device | str,
     ) -> None:
-        """Place each pixel's ray in each source photo; `pixels` of all are (H, W) float32 grey values in 0..1."""
-        height, width = reference.height, reference.width
+        """`pixels` of all are (H, W) float32 grey values in 0..1."""
         self.best = min(best_sources, len(sources))
-        u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        rays = np.linalg.inv(reference.intrinsics) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
-        rotation, shift = reference.cam_from_world[:3, :3], reference.cam_from_world[:3, 3]
         pixels = torch.from_numpy(_centred(reference.pixels)).to(device)
         self.weights = support_weights(pixels, window_px)
         mean = self._mean(pixels)
@@ -60,35 +61,43 @@ class Matcher:
         self.reference, self.mean, self.variance = self.windows
         self.sources: list[tuple[Tensor, Tensor, Tensor]] = []
         for source in sources:
-            turn = source.cam_from_world[:3, :3] @ rotation.T
-            move = source.cam_from_world[:3, 3] - turn @ shift
+            source_from_reference = source.cam_from_world @ reference.world_from_cam
             # From pixels to grid_sample's -1..1, where 0.5 px is the first pixel's centre.
             to_grid = np.array([[2 / source.width, 0, -1], [0, 2 / source.height, -1], [0, 0, 1]]) @ source.intrinsics
-            directions = (to_grid @ turn @ rays).reshape(3, height, width)
+            turn = to_grid @ source_from_reference[:3, :3] @ np.linalg.inv(reference.intrinsics)
+            camera = (
+                torch.from_numpy(part.astype(np.float32)) for part in (turn, to_grid @ source_from_reference[:3, 3])
+            )
             self.sources.append(
-                (
-                    torch.from_numpy(_centred(source.pixels))[None, None].to(device),
-                    torch.from_numpy(directions.astype(np.float32)).to(device),
-                    torch.from_numpy((to_grid @ move).astype(np.float32)).to(device),
-                )
+                (torch.from_numpy(_centred(source.pixels))[None, None].to(device), *(c.to(device) for c in camera))
             )
 
     def score(self, inverse: Tensor) -> Tensor:
         """Mean NCC of the best sources for D hypotheses per pixel: (D, h, w) inverse depths -> (D, h, w) in -1..1."""
+        if inverse.device.type == "cpu":
+            return self._score_on_cpu(inverse.contiguous())
         best = inverse.new_full((self.best, *inverse.shape), OUTSIDE_SCORE)
-        keep = self._keep_best_on_cpu if inverse.device.type == "cpu" else self.keep_best
         for source in self.sources:
-            keep(inverse, best, *source)
+            self.keep_best(inverse, best, *source)
         return best.mean(0)
 
-    def _keep_best_on_cpu(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
-        """The same as `keep_best`, by the CPU's kernel."""
-        first, last = (inverse.contiguous(), self.windows, self.weights), (gray[0, 0], directions, move, best)
-        keep_best_on_cpu(*(p.numpy() for p in (*first, *last)))  # type: ignore[call-arg]
+    def _score_on_cpu(self, inverse: Tensor) -> Tensor:
+        """The same by the CPU's kernel."""
+        result, window = torch.empty_like(inverse), self.weights.shape[2]
+        arrays = (p.numpy() for p in (inverse, self.windows, self.weights, *self._photos))
+        score_on_cpu(*arrays, self.best, (0,) * window, result.numpy())
+        return result
 
-    def keep_best(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
+    @cached_property
+    def _photos(self) -> list[Tensor]:
+        """The pixels of all source photos, one photo behind the other; (S, 2) heights and widths; their cameras."""
+        photos, *cameras = zip(*self.sources)
+        sizes = torch.tensor([photo.shape[2:] for photo in photos])
+        return [torch.cat([photo.flatten() for photo in photos]), sizes, *(torch.stack(part) for part in cameras)]
+
+    def keep_best(self, inverse: Tensor, best: Tensor, gray: Tensor, turn: Tensor, move: Tensor) -> None:
         """Put the scores of one of `sources` among the best (K, D, h, w), the largest first."""
-        score = self._ncc(inverse, gray, directions, move)
+        score = self._ncc(inverse, gray, turn, move)
         for k in range(self.best):
             best[k], score = torch.maximum(best[k], score), torch.minimum(best[k], score)
 
@@ -96,19 +105,22 @@ class Matcher:
         """Number (h, w) of source photos in which a hypothesis per pixel (h, w) lies."""
         return sum(self._place(inverse[None], *source[1:])[1][0].int() for source in self.sources)  # type: ignore[return-value]
 
-    @staticmethod
-    def _place(inverse: Tensor, directions: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
+    def _directions(self, turn: Tensor, stride: int = 1) -> Tensor:
+        """(3, h, w) homogeneous places, in a source photo, of the rays of every stride-th pixel."""
+        height, width = self.reference.shape
+        v, u = (torch.arange(0, side, stride, device=turn.device) + 0.5 for side in (height, width))
+        return turn[:, 0, None, None] * u + turn[:, 1, None, None] * v[:, None] + turn[:, 2, None, None]
+
+    def _place(self, inverse: Tensor, turn: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
         """Where D hypotheses per pixel lie in a source photo, (D, h, w, 2) in -1..1, and whether they do, (D, h, w)."""
-        z = directions[2] + move[2] * inverse
+        x, y, z = (direction + step * inverse for direction, step in zip(self._directions(turn), move))
         scale = 1 / z.clamp(min=1e-6)
-        grid = torch.stack(
-            [(directions[0] + move[0] * inverse) * scale, (directions[1] + move[1] * inverse) * scale], dim=-1
-        )
+        grid = torch.stack([x * scale, y * scale], dim=-1)
         return grid, (z > 1e-6) & (grid.abs().amax(-1) < 1)
 
-    def _ncc(self, inverse: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> Tensor:
+    def _ncc(self, inverse: Tensor, gray: Tensor, turn: Tensor, move: Tensor) -> Tensor:
         """NCC of one source, (D, h, w); OUTSIDE_SCORE where the hypothesis lies outside the source photo."""
-        grid, inside = self._place(inverse, directions, move)
+        grid, inside = self._place(inverse, turn, move)
         count, height, width = inverse.shape
         grid = grid.reshape(1, count * height, width, 2)
         warped = F.grid_sample(gray, grid, padding_mode="border", align_corners=False)
@@ -134,9 +146,9 @@ class Matcher:
     def _shifts(self, low: float, high: float) -> list[float]:
         """Shift in each source photo, in its pixels; 0 where both ends of the range never lie in it."""
         shifts = []
-        for gray, directions, move in self.sources:
+        for gray, turn, move in self.sources:
             half = torch.tensor([gray.shape[-1] / 2, gray.shape[-2] / 2], device=gray.device)
-            thinned = directions[:, ::8, ::8]
+            thinned = self._directions(turn, 8)
             ends = []
             for inverse in (low, high):
                 p = thinned + move[:, None, None] * inverse
@@ -158,21 +170,19 @@ def support_weights(gray: Tensor, window: int) -> Tensor:
         gray: (h, w) in 0..1.
         window: its side, odd.
     """
-    radius = window // 2
-    parts = []
-    for axis in (0, 1):
-        values = gray.movedim(axis, 0)  # the axis that the support runs along, first
-        padded = F.pad(values, (0, 0, radius, radius), value=float("inf"))
-        weights = []
-        for k in range(window):
-            step = (padded[k : k + len(values)] - values).abs()
-            weight = torch.exp(-step / GREY_FALL - abs(k - radius) / (DISTANCE_FALL * radius))
+    radius, (height, width) = window // 2, gray.shape
+    weights = gray.new_zeros(2, height, window, width)
+    weights[:, :, radius] = 1
+    for axis, part in zip((1, 0), weights.movedim(2, 1)):
+        for k in range(1, radius + 1):
+            count = gray.shape[axis] - k
+            step = (gray.narrow(axis, k, count) - gray.narrow(axis, 0, count)).abs()
+            weight = torch.exp(-step / GREY_FALL - k / (DISTANCE_FALL * radius))
             # Beside a dark statue, the smallest weight is texture enough for a blank sky to match at its depth.
-            weights.append(weight * (step < 4 * GREY_FALL))
-        stacked = torch.stack(weights, dim=1)
-        stacked = (stacked / stacked.sum(1, keepdim=True)).transpose(0, 2 * axis)
-        parts.append(stacked)
-    return torch.stack([parts[1], parts[0]])
+            weight *= step < 4 * GREY_FALL
+            part[radius + k].narrow(axis, 0, count).copy_(weight)
+            part[radius - k].narrow(axis, k, count).copy_(weight)
+    return weights.div_(weights.sum(2, keepdim=True))
 
 
 def supported_mean(values: Tensor, weights: Tensor) -> Tensor:
@@ -190,38 +200,33 @@ def supported_mean(values: Tensor, weights: Tensor) -> Tensor:
     return total
 
 
-def box(values: Tensor, window: int) -> Tensor:
-    """Mean over a window of the last two axes; at the border, over what the padding by zero leaves."""
-    radius = window // 2
-    padded = F.pad(values, (radius + 1, radius, radius + 1, radius))
-    sums = padded.cumsum(-1)
-    sums = (sums[..., window:] - sums[..., :-window]).cumsum(-2)
-    return (sums[..., window:, :] - sums[..., :-window, :]) / window**2
-
-
 def _centred(gray: NDArray[np.float32]) -> NDArray[np.float32]:
     """The photo (H, W) without its mean, so that sums of squares stay small and exact."""
     return gray - gray.mean()
 
 
 @njit(fastmath=_MATH, error_model="numpy")
-def _place(inverse, directions, move, y, width, height, place, part_x, part_y, inside):
-    """Where one row y of the reference lies in the source photo.
+def _place(inverse, turn, move, left, y, width, height, place, part_x, part_y, inside):
+    """Where one row y of the reference, from the column `left` on, lies in a source photo.
 
-    All float32 but `place`: inverse (w,) inverse depths; directions (3, h, w) and move (3,) give places in -1..1; width
-    and height of the source photo. Written: place (w,) int32 index of the upper left pixel of four, part_x and part_y
-    (w,) the place between them in 0..1, inside (w,) 1 where it lies in the photo, else 0.
+    All float32 but `place`: inverse (w,) inverse depths; turn (3, 3) and move (3,) give places in -1..1; width and
+    height of the source photo. Written: place (w,) int32 index of the upper left pixel of four, part_x and part_y (w,)
+    the place between them in 0..1, inside (w,) 1 where it lies in the photo, else 0.
     """
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
-    direction_x, direction_y, direction_z = directions[0, y], directions[1, y], directions[2, y]
+    row = np.float32(y) + half
+    row_x, row_y, row_z = turn[0, 1] * row + turn[0, 2], turn[1, 1] * row + turn[1, 2], turn[2, 1] * row + turn[2, 2]
+    step_x, step_y, step_z = turn[0, 0], turn[1, 0], turn[2, 0]
+    move_x, move_y, move_z = move[0], move[1], move[2]
     half_x, half_y = np.float32(width) * half, np.float32(height) * half
     last_x, last_y = np.float32(width - 1), np.float32(height - 1)
     end_x, end_y = np.int32(width - 2), np.int32(height - 2)
     for x in range(len(inverse)):
-        z = direction_z[x] + move[2] * inverse[x]
+        column = np.float32(np.int32(left + x)) + half
+        z = row_z + step_z * column + move_z * inverse[x]
         scale = one / max(z, np.float32(1e-6))
-        u = (direction_x[x] + move[0] * inverse[x]) * scale
-        v = (direction_y[x] + move[1] * inverse[x]) * scale
+        u = (row_x + step_x * column + move_x * inverse[x]) * scale
+        v = (row_y + step_y * column + move_y * inverse[x]) * scale
         inside[x] = one if (z > np.float32(1e-6)) & (abs(u) < one) & (abs(v) < one) else zero
         px = min(max((u + one) * half_x - half, zero), last_x)
         py = min(max((v + one) * half_y - half, zero), last_y)
@@ -233,8 +238,9 @@ def _place(inverse, directions, move, y, width, height, place, part_x, part_y, i
 
 
 @njit(fastmath=_MATH, error_model="numpy")
-def _warp(flat, width, place, part_x, part_y, value):
-    """Bilinear samples value (w,) of a photo flat (H * width,); place, part_x and part_y as `_place` writes them."""
+def _warp(flat, width, place, part_x, part_y, middle, value):
+    """Bilinear samples value (w,) of a photo flat (H * width,), less the grey value middle; place and parts as `_place`
+    writes them."""
     for x in range(len(place)):
         at = np.uint32(place[x])
         below = np.uint32(at + width)
@@ -242,64 +248,44 @@ def _warp(flat, width, place, part_x, part_y, value):
         c, d = flat[below], flat[np.uint32(below + 1)]
         upper = a + part_x[x] * (b - a)
         lower = c + part_x[x] * (d - c)
-        value[x] = upper + part_y[x] * (lower - upper)
+        value[x] = upper + part_y[x] * (lower - upper) - middle
 
 
 @njit(fastmath=_MATH)
-def _sums_along(value, reference, weight, sums):
-    """Weighted sums along a row of a value (w,), of its square and of its product with the reference (w,).
+def _sums_along(value, reference, weight, taps, width, sums):
+    """Weighted sums along a row of a value, of its square and of its product with the reference.
 
-    weight (window, w): of the pixels from left to right in the support of each. Written: sums (3 w,), one behind the
-    other; outside the row is zero.
+    value, reference (w + window - 1,); weight (window * TILE,): of the pixels from left to right in the support of
+    each; taps: a tuple as long as the window. Written: sums (3 * TILE,), one behind the other.
     """
-    width, radius = len(value), len(weight) // 2
-    row = np.zeros(width + 2 * radius, np.float32)
-    inner = row[radius : radius + width]
-    for k in range(3):
-        for x in range(width):
-            inner[x] = value[x] * (np.float32(1.0) if k == 0 else value[x] if k == 1 else reference[x])
-        out, share = sums[k * width : (k + 1) * width], weight[0]
-        for x in range(width):
-            out[x] = share[x] * row[x]
-        for w in range(1, len(weight)):
-            shifted, share = row[w : w + width], weight[w]
-            for x in range(width):
-                out[x] += share[x] * shifted[x]
-
-
-@njit(fastmath=_MATH)
-def _sum_across(rows, first, weight, total):
-    """Weighted sums across rows (window, 3 w), a ring of which `first` is the uppermost, into total (3 w,).
-
-    weight (window, w): of the rows from top to bottom in the support of each pixel.
-    """
-    window, width = weight.shape
-    for k in range(3):
-        out = total[k * width : (k + 1) * width]
-        for w in range(window):
-            part, share = rows[(first + w) % window, k * width : (k + 1) * width], weight[w]
-            if w == 0:
-                for x in range(width):
-                    out[x] = share[x] * part[x]
-            else:
-                for x in range(width):
-                    out[x] += share[x] * part[x]
+    for x in range(min(width, TILE)):  # the compiler then knows that no index runs over
+        first = second = both = np.float32(0.0)
+        for k in range(len(taps)):
+            part = weight[k * TILE + x] * value[x + k]
+            first += part
+            second += part * value[x + k]
+            both += part * reference[x + k]
+        sums[x], sums[TILE + x], sums[2 * TILE + x] = first, second, both
 
 
 @njit(fastmath=_MATH, error_model="numpy")
-def _correlate(sums, mean, variance, inside, score):
+def _correlate(sums, weight, taps, mean, variance, inside, score):
     """Normalised cross-correlation of a row's windows, into score (w,).
 
-    sums (3 w,): weighted means over whole windows, as `_sums_along` orders them; mean and variance (w,) of the
-    reference's windows; inside (w,) as `_place` writes it.
+    sums (window * 3 * TILE,): of the rows from top to bottom, as `_sums_along` writes them; weight (window * TILE,): of
+    these rows in the support of each pixel; mean and variance (w,) of the reference's windows; inside (w,) as `_place`
+    writes it.
     """
-    width, flat = len(score), np.float32(NOISE_VARIANCE)
-    first, second, both = sums[:width], sums[width : 2 * width], sums[2 * width :]
-    for x in range(width):
-        average = first[x]
-        spread = max(second[x] - average * average, np.float32(0.0))
-        covariance = both[x] - average * mean[x]
-        ncc = covariance / math.sqrt((spread + flat) * (variance[x] + flat))
+    flat = np.float32(NOISE_VARIANCE)
+    for x in range(min(len(score), TILE)):
+        first = second = both = np.float32(0.0)
+        for k in range(len(taps)):
+            share = weight[k * TILE + x]
+            first += share * sums[3 * k * TILE + x]
+            second += share * sums[(3 * k + 1) * TILE + x]
+            both += share * sums[(3 * k + 2) * TILE + x]
+        spread = max(second - first * first, np.float32(0.0))
+        ncc = (both - first * mean[x]) / math.sqrt((spread + flat) * (variance[x] + flat))
         score[x] = ncc if inside[x] > np.float32(0.0) else np.float32(OUTSIDE_SCORE)
 
 
@@ -313,40 +299,66 @@ def _insert(score, best):
 
 
 @njit(parallel=True, cache=True)
-def keep_best_on_cpu(inverse, windows, weights, gray, directions, move, best):  # type: ignore[no-untyped-def]
-    """Match D hypotheses per pixel in one source photo, and keep the best scores seen so far.
+def score_on_cpu(inverse, windows, weights, photos, sizes, turns, moves, keep, taps, result):  # type: ignore[no-untyped-def]
+    """Mean NCC of the best `keep` sources for D hypotheses per pixel, into result (D, h, w).
 
     All float32: inverse (D, h, w) inverse depths; windows (3, h, w) the reference, and the mean and variance of its
-    windows; weights (2, h, window, w) along the rows and across them, as `support_weights` makes them; gray (H, W)
-    source photo; directions (3, h, w) and move (3,) give its places in -1..1; best (K, D, h, w), sorted, the largest
-    first: changed in place.
+    windows; weights (2, h, window, w) along the rows and across them, as `support_weights` makes them; photos (sum of
+    H * W,) of S sources, one behind the other, of heights and widths sizes (S, 2) int64; turns (S, 3, 3) and moves
+    (S, 3) give places in -1..1; taps: a tuple as long as the window, by which the compiler knows its length.
     """
-    reference, mean, variance = windows[0], windows[1], windows[2]
-    along, across = weights[0], weights[1]
     count, height, width = inverse.shape
-    window = along.shape[1]
-    radius = window // 2
-    band = 32  # rows
-    bands = (height + band - 1) // band
-    for job in prange(count * bands):
-        d, top = job // bands, job % bands * band
-        pixels, size_x, size_y = gray.ravel(), gray.shape[1], gray.shape[0]
-        place, inside = np.zeros(width, np.int32), np.zeros((window, width), np.float32)
-        part_x, part_y = np.zeros(width, np.float32), np.zeros(width, np.float32)
-        value, score = np.zeros(width, np.float32), np.zeros(width, np.float32)
-        # Sums along the last `window` rows, and over the whole windows.
-        sums, total = np.zeros((window, 3 * width), np.float32), np.zeros(3 * width, np.float32)
-        for y in range(top - radius, min(top + band, height) + radius):
-            slot = (y + window) % window
-            if 0 <= y < height:
-                _place(inverse[d, y], directions, move, y, size_x, size_y, place, part_x, part_y, inside[slot])
-                _warp(pixels, np.uint32(size_x), place, part_x, part_y, value)
-                _sums_along(value, reference[y], along[y], sums[slot])
-            else:
-                sums[slot] = np.float32(0.0)
-            middle = y - radius
-            if middle >= top:
-                _sum_across(sums, (slot + 1) % window, across[middle], total)
-                _correlate(total, mean[middle], variance[middle], inside[middle % window], score)
-                for k in range(best.shape[0]):
-                    _insert(score, best[k, d, middle])
+    window = len(taps)
+    radius, rows, columns = window // 2, 32, TILE - window + 1
+    across = (width + columns - 1) // columns
+    for tile in prange(across * ((height + rows - 1) // rows)):
+        top, left = tile // across * rows, tile % across * columns
+        bottom, right = min(top + rows, height), min(left + columns, width)
+        # The same with the halo, as far as the photo goes; columns and rows of buffers begin at the halo's.
+        above, below = max(top - radius, 0), min(bottom + radius, height)
+        before, behind = max(left - radius, 0), min(right + radius, width)
+        lead, reach = before - left + radius, behind - before
+        along, down = (
+            np.zeros((rows + 2 * radius, window * TILE), np.float32),
+            np.zeros((rows, window * TILE), np.float32),
+        )
+        reference = np.zeros((rows + 2 * radius, TILE), np.float32)
+        inside = np.zeros((rows + 2 * radius, TILE), np.float32)
+        # Without it, sums of squares are small and exact.
+        middle = windows[1, top, left]
+        for y in range(above, below):
+            reference[y - top + radius, lead : lead + reach] = windows[0, y, before:behind] - middle
+            for k in range(window):
+                along[y - top + radius, k * TILE : k * TILE + right - left] = weights[0, y, k, left:right]
+                if top <= y < bottom:
+                    down[y - top, k * TILE : k * TILE + right - left] = weights[1, y, k, left:right]
+        place, score = np.zeros(reach, np.int32), np.zeros(right - left, np.float32)
+        part_x, part_y, value = np.zeros(reach, np.float32), np.zeros(reach, np.float32), np.zeros(TILE, np.float32)
+        sums = np.zeros((rows + 2 * radius) * 3 * TILE, np.float32)
+        best = np.zeros((keep, rows, right - left), np.float32)
+        for d in range(count):
+            best[:] = np.float32(OUTSIDE_SCORE)
+            start = 0
+            for s in range(len(sizes)):
+                high, wide = sizes[s, 0], sizes[s, 1]
+                photo = photos[start : start + high * wide]
+                start += high * wide
+                for y in range(above, below):
+                    k = y - top + radius
+                    _place(
+                        inverse[d, y, before:behind], turns[s], moves[s], before, y, wide, high, place, part_x, part_y,
+                        inside[k, lead:],
+                    )  # fmt: skip
+                    _warp(photo, np.uint32(wide), place, part_x, part_y, middle, value[lead:])
+                    _sums_along(value, reference[k], along[k], taps, right - left, sums[k * 3 * TILE :])
+                for k in range(bottom - top):
+                    mean, variance = windows[1, top + k, left:right] - middle, windows[2, top + k, left:right]
+                    _correlate(sums[k * 3 * TILE :], down[k], taps, mean, variance, inside[k + radius, radius:], score)
+                    for j in range(keep):
+                        _insert(score, best[j, k])
+            for k in range(bottom - top):
+                for x in range(right - left):
+                    total = np.float32(0.0)
+                    for j in range(keep):
+                        total += best[j, k, x]
+                    result[d, top + k, left + x] = total / np.float32(keep)

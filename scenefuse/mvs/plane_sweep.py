@@ -10,16 +10,18 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numba import njit, prange
 from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
 from scenefuse.core.stage import setting
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.matcher import NOISE_VARIANCE, Matcher, box, support_weights, supported_mean
+from scenefuse.geometry.matcher import NOISE_VARIANCE, Matcher, support_weights, supported_mean
 from scenefuse.photos.workspace import View
 
 # Side of the windows that planes are fitted in, for depths and for normals: windows of 5 let the depths of single
@@ -160,40 +162,45 @@ def _sweep(matcher: Matcher, low: float, high: float, settings: DepthMapSettings
     count = int(np.clip(math.ceil(shift / 0.75), 16, settings.planes))
     planes = torch.linspace(low, high, count, device=matcher.reference.device)
     height, width = matcher.reference.shape
-    cost = torch.empty(count, height, width, device=planes.device)
+    cost = torch.empty(height, width, count)
     for start in range(0, count, 16):
         chunk = planes[start : start + 16, None, None].expand(-1, height, width)
-        cost[start : start + 16] = 1 - matcher.score(chunk)
-    total = _semi_global(cost, settings.smoothness, 4 * settings.smoothness)
-    chosen = total.argmin(0)
+        cost[..., start : start + 16] = 1 - matcher.score(chunk).permute(1, 2, 0)
+    total = torch.zeros_like(cost)
+    small = np.float32(settings.smoothness)
+    _semi_global(cost.numpy(), small, 4 * small, total.numpy())
+    total = total.to(planes.device)
+    chosen = total.argmin(-1)
     inner = chosen.clamp(1, count - 2)
-    before, middle, after = (total.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))
+    before, middle, after = (total.gather(-1, (inner + k)[..., None])[..., 0] for k in (-1, 0, 1))
     step = (high - low) / (count - 1)
     inverse = planes[chosen] + step * _parabola(before, middle, after) * (inner == chosen)
     return inverse, step
 
 
-def _semi_global(cost: Tensor, small: float, large: float) -> Tensor:
-    """Sum of the path costs along four directions, (D, h, w), for a (D, h, w) matching cost."""
-    total = torch.zeros_like(cost)
-    for axis in (1, 2):
-        lines = cost.movedim(axis, 0).contiguous()
-        for backward in (False, True):
-            path = torch.empty_like(lines)
-            order = range(len(lines) - 1, -1, -1) if backward else range(len(lines))
-            previous: Tensor | None = None
-            for k in order:
-                if previous is None:
-                    path[k] = lines[k]
-                else:
-                    floor = previous.amin(0, keepdim=True)
-                    best = torch.minimum(previous, floor + large)
-                    best[1:] = torch.minimum(best[1:], previous[:-1] + small)
-                    best[:-1] = torch.minimum(best[:-1], previous[1:] + small)
-                    path[k] = lines[k] + best - floor
-                previous = path[k]
-            total += path.movedim(0, axis)
-    return total
+@njit(cache=True, parallel=True)
+def _semi_global(cost, small, large, total):  # type: ignore[no-untyped-def]
+    """Add to total (h, w, D) the path costs along four directions, for a matching cost (h, w, D) float32."""
+    height, width, count = cost.shape
+    for axis in range(2):
+        lines, length = (height, width) if axis == 0 else (width, height)
+        for line in prange(lines):
+            for way in range(2):
+                previous = np.full(count + 2, np.inf, np.float32)
+                current, floor = np.empty(count, np.float32), np.float32(0)
+                previous[1:-1] = 0
+                for step in range(length):
+                    at = step if way == 0 else length - 1 - step
+                    y, x = (np.int64(line), at) if axis == 0 else (at, np.int64(line))
+                    own, out = cost[y, x], total[y, x]
+                    for d in range(count):
+                        beside = min(previous[d], previous[d + 2]) + small
+                        current[d] = own[d] + min(min(previous[d + 1], beside), floor + large) - floor
+                        out[d] += current[d]
+                    floor = np.float32(np.inf)
+                    for d in range(count):
+                        previous[d + 1] = current[d]
+                        floor = min(floor, current[d])
 
 
 def _refine(matcher: Matcher, inverse: Tensor, step: float, low: float, high: float) -> tuple[Tensor, Tensor]:
@@ -231,41 +238,79 @@ def _local_planes(inverse: Tensor, score: Tensor, window: int) -> tuple[Tensor, 
     """Smoothed inverse depth (h, w) and its slopes per pixel (2, h, w), from plane fits that keep edges.
 
     A plane's inverse depth is linear in the pixel, so a weighted linear fit in a window is a plane fit.
-    Each pixel takes the fit, out
-    of nine windows that contain it, whose residual is smallest (Kuwahara 1976): no fit crosses a depth edge.
+    Each pixel takes the fit, out of nine windows that contain it, whose residual is smallest (Kuwahara 1976): no fit
+    crosses a depth edge.
+    """
+    fits, found = np.empty((4, *inverse.shape)), np.empty((3, *inverse.shape), np.float32)
+    _fit_planes(inverse.cpu().numpy(), (score.clamp(min=0.02) ** 2).cpu().numpy(), window, fits)
+    _take_planes(fits, window // 2, found)
+    smooth, *slopes = torch.from_numpy(found).to(inverse.device)
+    return smooth, torch.stack(slopes)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _fit_planes(inverse, weight, window, fits):  # type: ignore[no-untyped-def]
+    """Slopes, value at the middle and mean squared residual, fits (4, h, w), of a plane in the window of each pixel.
+
+    inverse, weight: (h, w) float32.
     """
     height, width = inverse.shape
-    weight = score.clamp(min=0.02) ** 2
     radius = window // 2
-    v, u = torch.meshgrid(
-        torch.arange(height, device=inverse.device, dtype=torch.float64),
-        torch.arange(width, device=inverse.device, dtype=torch.float64),
-        indexing="ij",
-    )
-    w, q = weight.double(), inverse.double()
-    s = {
-        name: box(values, window)
-        for name, values in {
-            "1": w, "u": w * u, "v": w * v, "uu": w * u * u, "uv": w * u * v, "vv": w * v * v,
-            "q": w * q, "uq": w * u * q, "vq": w * v * q, "qq": w * q * q,
-        }.items()
-    }  # fmt: skip
-    mu, mv, mq = s["u"] / s["1"], s["v"] / s["1"], s["q"] / s["1"]
-    uu, uv, vv = s["uu"] / s["1"] - mu * mu, s["uv"] / s["1"] - mu * mv, s["vv"] / s["1"] - mv * mv
-    uq, vq, qq = s["uq"] / s["1"] - mu * mq, s["vq"] / s["1"] - mv * mq, s["qq"] / s["1"] - mq * mq
-    determinant = (uu * vv - uv * uv).clamp(min=1e-6)
-    a, b = (uq * vv - vq * uv) / determinant, (vq * uu - uq * uv) / determinant
-    residual = (qq - a * uq - b * vq).clamp(min=0)
-    fits = torch.stack([a, b, mq - a * mu - b * mv, residual])
-    padded = F.pad(fits[None], (radius,) * 4, mode="replicate")[0]
-    best = fits.clone()
-    best[3] *= 0.8  # the centred window wins ties
-    for dv in range(0, window, radius):
-        for du in range(0, window, radius):
-            other = padded[:, dv : dv + height, du : du + width]
-            best = torch.where(other[3:] < best[3:], other, best)
-    smooth = best[0] * u + best[1] * v + best[2]
-    return smooth.float(), best[:2].float()
+    for line in prange(height):
+        y = np.int64(line)
+        # Sums over the rows: of w, w v, w v v, w q, w q v, w q q, where v counts from the middle.
+        rows = np.zeros((6, width + 2 * radius))
+        for v in range(max(-radius, -y), min(radius, height - 1 - y) + 1):
+            for x in range(width):
+                w, q = np.float64(weight[y + v, x]), np.float64(inverse[y + v, x])
+                rows[0, x + radius] += w
+                rows[1, x + radius] += w * v
+                rows[2, x + radius] += w * v * v
+                rows[3, x + radius] += w * q
+                rows[4, x + radius] += w * q * v
+                rows[5, x + radius] += w * q * q
+        # And over all: of w, w u, w v, w u u, w u v, w v v, w q, w q u, w q v, w q q.
+        sums = np.zeros((10, width))
+        for k in range(window):
+            u = np.float64(k - radius)
+            for x in range(width):
+                sums[0, x] += rows[0, x + k]
+                sums[1, x] += rows[0, x + k] * u
+                sums[2, x] += rows[1, x + k]
+                sums[3, x] += rows[0, x + k] * u * u
+                sums[4, x] += rows[1, x + k] * u
+                sums[5, x] += rows[2, x + k]
+                sums[6, x] += rows[3, x + k]
+                sums[7, x] += rows[3, x + k] * u
+                sums[8, x] += rows[4, x + k]
+                sums[9, x] += rows[5, x + k]
+        for x in range(width):
+            w = sums[0, x]
+            mu, mv, mq = sums[1, x] / w, sums[2, x] / w, sums[6, x] / w
+            uu, uv, vv = sums[3, x] / w - mu * mu, sums[4, x] / w - mu * mv, sums[5, x] / w - mv * mv
+            uq, vq, qq = sums[7, x] / w - mu * mq, sums[8, x] / w - mv * mq, sums[9, x] / w - mq * mq
+            determinant = max(uu * vv - uv * uv, 1e-6)
+            a, b = (uq * vv - vq * uv) / determinant, (vq * uu - uq * uv) / determinant
+            fits[0, y, x], fits[1, y, x], fits[2, y, x] = a, b, mq - a * mu - b * mv
+            fits[3, y, x] = max(qq - a * uq - b * vq, 0.0)
+
+
+@njit(cache=True, parallel=True)
+def _take_planes(fits, radius, found):  # type: ignore[no-untyped-def]
+    """Value and slopes, found (3, h, w), of the plane with the least residual, of nine windows around each pixel."""
+    height, width = fits.shape[1:]
+    for line in prange(height):
+        y = np.int64(line)
+        for x in range(width):
+            row, column, least = y, x, 0.8 * fits[3, y, x]  # the centred window wins ties
+            for v in range(-radius, radius + 1, radius):
+                for u in range(-radius, radius + 1, radius):
+                    j, i = min(max(y + v, 0), height - 1), min(max(x + u, 0), width - 1)
+                    if fits[3, j, i] < least:
+                        row, column, least = j, i, fits[3, j, i]
+            a, b = fits[0, row, column], fits[1, row, column]
+            found[0, y, x] = fits[2, row, column] + a * (x - column) + b * (y - row)
+            found[1, y, x], found[2, y, x] = a, b
 
 
 def _normals(inverse: Tensor, slopes: Tensor, intrinsics: Array) -> Tensor:
@@ -289,9 +334,7 @@ def _upsampled(inverse: Tensor, width: int, height: int) -> Tensor:
 
 def _median3(values: Tensor) -> Tensor:
     """Median over 3x3 pixels of an (h, w) map."""
-    height, width = values.shape
-    padded = F.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    return torch.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]).median(0).values
+    return torch.from_numpy(cv2.medianBlur(values.cpu().numpy(), 3)).to(values.device)
 
 
 def is_measured(matcher: Matcher, inverse: Tensor, score: Tensor, min_score: float, pixel: float) -> Tensor:
