@@ -3,6 +3,7 @@
 Source: Merrell et al. 2007 (a depth map's free-space violations in others count against it).
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -151,16 +152,33 @@ def _compare(points, compared, depths, masks, covered, intrinsics, frame_from_ca
 
 
 @dataclass(frozen=True)
+class DepthMap:
+    """What stereo says of one photo, at its maps' size.
+
+    Attributes:
+        view: its camera; `pixels` are depths along z, (H, W) float32, 0 for none.
+        normals: (H, W, 3) float32 unit normals in the world.
+        colors: (H, W, 3) uint8.
+    """
+
+    view: View
+    normals: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
 class Votes:
     """How other depth maps agree with one, per pixel (H, W).
 
     Attributes:
-        agree: number of maps that hold the same depth there.
+        agree: number of maps that hold the same surface there.
         through: number of maps that measured a surface behind it: it floats in front of theirs.
+        mean: (H, W, 7) mean depth, normal and colour of it and of those that agree.
     """
 
     agree: NDArray[np.uint16]
     through: NDArray[np.uint16]
+    mean: NDArray[np.float32]
 
 
 def neighbours(sources: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
@@ -174,24 +192,36 @@ def neighbours(sources: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
     return {name: sorted(others) for name, others in found.items()}
 
 
-def vote(view: View, others: Iterable[View], max_depth_error: float, max_reprojection_px: float) -> Votes:
+def vote(
+    own: DepthMap,
+    others: Iterable[DepthMap],
+    max_depth_error: float,
+    max_reprojection_px: float,
+    max_normal_error_deg: float,
+) -> Votes:
     """Votes of other depth maps on one.
 
-    A point agrees with another map's when their depths differ by little there, and when the other's point, projected
-    back, falls near the pixel. The other map sees through it where all of its pixels around the place lie behind the
-    point by more than that distance in pixels.
+    A point agrees with another map's when their depths and normals differ by little there, and when the other's point,
+    projected back, falls near the pixel. The other map sees through it where all of its pixels around the place lie
+    behind the point by more than that distance in pixels.
 
     Args:
-        view: `pixels` are depths along z, (H, W) float32, 0 for none.
-        others: likewise, each at its own size.
+        own: the map that is voted on.
+        others: the maps that vote, each at its own size.
         max_depth_error: largest relative difference of two depths of a point.
         max_reprojection_px: largest distance between a pixel and the other map's point projected into it.
+        max_normal_error_deg: largest angle between two normals of a point.
     """
-    agree, through = np.zeros(view.pixels.shape, np.uint16), np.zeros(view.pixels.shape, np.uint16)
+    depth = own.view.pixels
+    agree, through = np.zeros(depth.shape, np.uint16), np.zeros(depth.shape, np.uint16)
+    total = np.concatenate([depth[..., None], own.normals, own.colors], axis=2, dtype=np.float32)
+    limit = max_depth_error, max_reprojection_px, math.cos(math.radians(max_normal_error_deg))
     for other in others:
-        there, back = _between(view, other), _between(other, view)
-        _count(view.pixels, other.pixels, there, back, max_depth_error, max_reprojection_px, agree, through)
-    return Votes(agree, through)
+        between = _between(own.view, other.view), _between(other.view, own.view)
+        _count(
+            depth, own.normals, other.view.pixels, other.normals, other.colors, *between, *limit, agree, through, total
+        )
+    return Votes(agree, through, total / (agree + np.float32(1))[..., None])
 
 
 def _between(a: View, b: View) -> Array:
@@ -201,14 +231,18 @@ def _between(a: View, b: View) -> Array:
     return np.column_stack([turned, b.intrinsics @ b_from_a[:3, 3]])
 
 
-@njit(parallel=True, cache=True)
-def _count(depth, other, there, back, max_error, max_px, agree, through):  # type: ignore[no-untyped-def]
-    """Add one map's votes to agree and through (H, W) uint16.
+@njit(parallel=True, cache=True, error_model="numpy")
+def _count(  # type: ignore[no-untyped-def]
+    depth, normals, other, other_normals, colors, there, back, max_error, max_px, min_cosine, agree, through, total
+):
+    """Add one map's votes to agree and through (H, W) uint16, and what it holds where it agrees to total (H, W, 7).
 
-    depth (H, W) and other (h, w) float32, 0 for none; there and back (3, 4) as `_between` makes them.
+    depth (H, W) and other (h, w) float32, 0 for none; normals and colors of them likewise (..., 3); there and back
+    (3, 4) as `_between` makes them.
     """
     height, width = depth.shape
     for row in prange(height):
+        held = np.zeros(7, np.float32)
         for column in range(width):
             d = depth[row, column]
             if d <= 0:
@@ -222,9 +256,11 @@ def _count(depth, other, there, back, max_error, max_px, agree, through):  # typ
             left, top = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
             if left < 0 or top < 0 or left + 1 >= other.shape[1] or top + 1 >= other.shape[0]:
                 continue
-            same, behind = False, True
+            # All of the four pixels around that agree count, the more the nearer.
+            weight, behind, held[:] = 0.0, True, np.float32(0)
             for k in range(4):
-                e = other[top + k // 2, left + k % 2]
+                j, i = top + k // 2, left + k % 2
+                e = other[j, i]
                 bx, by = u * e, v * e
                 bz = back[2, 0] * bx + back[2, 1] * by + back[2, 2] * e + back[2, 3]
                 if e <= 0 or bz <= 0:
@@ -233,10 +269,24 @@ def _count(depth, other, there, back, max_error, max_px, agree, through):  # typ
                 off_x = (back[0, 0] * bx + back[0, 1] * by + back[0, 2] * e + back[0, 3]) / bz - (column + 0.5)
                 off_y = (back[1, 0] * bx + back[1, 1] * by + back[1, 2] * e + back[1, 3]) / bz - (row + 0.5)
                 near = off_x * off_x + off_y * off_y <= max_px * max_px
-                same |= near and e - max_error * z <= z <= e + max_error * z
                 behind &= (not near) and z < e
-            if same:
+                if not (near and e - max_error * z <= z <= e + max_error * z):
+                    continue
+                cosine = 0.0
+                for c in range(3):
+                    cosine += normals[row, column, c] * other_normals[j, i, c]
+                if cosine < min_cosine:
+                    continue
+                share = (1 - abs(u - 0.5 - i)) * (1 - abs(v - 0.5 - j)) + 1e-6
+                weight += share
+                held[0] += share * bz
+                for c in range(3):
+                    held[1 + c] += share * other_normals[j, i, c]
+                    held[4 + c] += share * colors[j, i, c]
+            if weight > 0:
                 agree[row, column] += np.uint16(1)
+                for c in range(7):
+                    total[row, column, c] += held[c] / weight
             elif behind:
                 through[row, column] += np.uint16(1)
 

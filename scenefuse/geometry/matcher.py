@@ -45,12 +45,7 @@ class Matcher:
     """
 
     def __init__(
-        self,
-        reference: View,
-        sources: list[View],
-        best_sources: int,
-        window_px: int,
-        device: torch.device | str,
+        self, reference: View, sources: list[View], best_sources: int, window_px: int, device: torch.device | str
     ) -> None:
         """`pixels` of all are (H, W) float32 grey values in 0..1."""
         self.best = min(best_sources, len(sources))
@@ -75,18 +70,14 @@ class Matcher:
     def score(self, inverse: Tensor) -> Tensor:
         """Mean NCC of the best sources for D hypotheses per pixel: (D, h, w) inverse depths -> (D, h, w) in -1..1."""
         if inverse.device.type == "cpu":
-            return self._score_on_cpu(inverse.contiguous())
+            result, window = torch.empty(inverse.shape), self.weights.shape[2]
+            arrays = (p.numpy() for p in (inverse.contiguous(), self.windows, self.weights, *self._photos))
+            score_on_cpu(*arrays, self.best, (0,) * window, result.numpy())  # type: ignore[call-arg]
+            return result
         best = inverse.new_full((self.best, *inverse.shape), OUTSIDE_SCORE)
         for source in self.sources:
             self.keep_best(inverse, best, *source)
         return best.mean(0)
-
-    def _score_on_cpu(self, inverse: Tensor) -> Tensor:
-        """The same by the CPU's kernel."""
-        result, window = torch.empty_like(inverse), self.weights.shape[2]
-        arrays = (p.numpy() for p in (inverse, self.windows, self.weights, *self._photos))
-        score_on_cpu(*arrays, self.best, (0,) * window, result.numpy())
-        return result
 
     @cached_property
     def _photos(self) -> list[Tensor]:
@@ -121,10 +112,8 @@ class Matcher:
     def _ncc(self, inverse: Tensor, gray: Tensor, turn: Tensor, move: Tensor) -> Tensor:
         """NCC of one source, (D, h, w); OUTSIDE_SCORE where the hypothesis lies outside the source photo."""
         grid, inside = self._place(inverse, turn, move)
-        count, height, width = inverse.shape
-        grid = grid.reshape(1, count * height, width, 2)
-        warped = F.grid_sample(gray, grid, padding_mode="border", align_corners=False)
-        warped = warped.reshape(count, height, width)
+        flat = grid.reshape(1, -1, inverse.shape[-1], 2)
+        warped = F.grid_sample(gray, flat, padding_mode="border", align_corners=False).reshape(inverse.shape)
         mean = self._mean(warped)
         variance = (self._mean(warped * warped) - mean * mean).clamp(min=0)
         covariance = self._mean(warped * self.reference) - mean * self.mean
@@ -135,16 +124,8 @@ class Matcher:
         """Weighted mean of values (..., h, w) over the support of each pixel."""
         return supported_mean(values, self.weights)
 
-    def shift_per_inverse_depth(self, low: float, high: float) -> float:
-        """Largest shift in any source photo, in its pixels, between the two ends of the inverse depth range."""
-        return max(self._shifts(low, high))
-
-    def middle_shift_per_inverse_depth(self, low: float, high: float) -> float:
-        """The same in the middle one of the source photos: half of them move by at least as much."""
-        return float(np.median(self._shifts(low, high)))
-
-    def _shifts(self, low: float, high: float) -> list[float]:
-        """Shift in each source photo, in its pixels; 0 where both ends of the range never lie in it."""
+    def shifts(self, low: float, high: float) -> list[float]:
+        """Shift in each source photo, in its pixels, between two inverse depths; 0 where both never lie in it."""
         shifts = []
         for gray, turn, move in self.sources:
             half = torch.tensor([gray.shape[-1] / 2, gray.shape[-2] / 2], device=gray.device)
@@ -356,9 +337,4 @@ def score_on_cpu(inverse, windows, weights, photos, sizes, turns, moves, keep, t
                     _correlate(sums[k * 3 * TILE :], down[k], taps, mean, variance, inside[k + radius, radius:], score)
                     for j in range(keep):
                         _insert(score, best[j, k])
-            for k in range(bottom - top):
-                for x in range(right - left):
-                    total = np.float32(0.0)
-                    for j in range(keep):
-                        total += best[j, k, x]
-                    result[d, top + k, left + x] = total / np.float32(keep)
+            result[d, top:bottom, left:right] = best.sum(0)[: bottom - top] / np.float32(keep)

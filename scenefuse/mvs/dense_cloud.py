@@ -1,28 +1,29 @@
-"""The dense cloud of a scene: its depth maps, fused by COLMAP's stereo fusion in a temporary workspace."""
+"""The dense cloud of a scene: what its depth maps confirm of each other, a point for each pixel of the finest one.
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+Source: Merrell et al. 2007.
+"""
+
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.cloud_file import NEIGHBOURS
-from scenefuse.cloud.clouds import Cloud, read_cloud, spacing
+from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
 from scenefuse.cloud.tiled_cloud import WHOLE, write_tiled
-from scenefuse.core.stage import StageError, quantity, read_json, scratch_directory, setting, threads, value, write_json
+from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, value, write_json
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.consistency import neighbours, vote
+from scenefuse.geometry.consistency import DepthMap, Votes, back_project, neighbours, vote
 from scenefuse.geometry.photo_check import MAX_PHOTOS
 from scenefuse.photos.geodesy import length_unit
-from scenefuse.photos.pictures import read_depth, write_depth
-from scenefuse.photos.workspace import View, posed_images, read_model, read_views
-from scenefuse.sfm.colmap import cancellable
+from scenefuse.photos.pictures import read_depth, read_normals, read_rgb
+from scenefuse.photos.workspace import View, read_views
 
 # Share of the measured pixels below which the cameras or the limits are probably wrong.
 MIN_FUSED_SHARE = 0.01
@@ -54,7 +55,7 @@ def fuse_depth_maps(
     cloud: Path,
     report: Path,
 ) -> None:
-    """Let the depth maps of all chunks vote on each other, and fuse what is left by COLMAP's stereo fusion.
+    """Let the depth maps of all chunks vote on each other, and make a cloud of what enough of them confirm.
 
     Args:
         workspace: the undistorted COLMAP workspace that the maps belong to.
@@ -80,14 +81,16 @@ def fuse_depth_maps(
     stages = [read_json(path) for path in depth_json]
     print(f"fusing {len(maps)} depth maps by {_all(stages, 'backend')}", flush=True)
     sources = {name: photo["sources"] for stage in stages for name, photo in stage["photos"].items()}
-    fused, measured, left = _fuse(workspace, maps, neighbours(sources), settings, cloud)
-    # COLMAP counts pixels, of which one photo may bring several; we count photos.
-    agreed = fused[fused.fields["views"] >= settings.min_photos]
-    if len(agreed) == 0:
-        raise _no_points(settings)
-    kept = agreed[near_others(agreed.points)]
-    print(f"{len(kept)} points, {len(agreed) - len(kept)} outliers dropped", flush=True)
-    content = _report(kept, len(agreed) - len(kept), measured, stages, length_unit(georeference_json))
+    fused, pixel, measured, left = _fuse(workspace, maps, neighbours(sources), settings)
+    if len(fused) == 0:
+        raise StageError(
+            f"no point is seen alike by {settings.min_photos} photos; lower scene.dense_cloud.min_photos, or check the"
+            " cameras"
+        )
+    near = near_others(fused.points)
+    kept = voxel_downsample(fused[near], pixel)
+    print(f"{len(kept)} points, {(~near).sum()} of {len(fused)} dropped as outliers before thinning", flush=True)
+    content = _report(kept, int((~near).sum()), measured, stages, length_unit(georeference_json))
     write_tiled(cloud, lambda: [kept], len(kept), kept.points)
     content |= {"depth_maps": quantity(len(maps), "1"), "outvoted_share": quantity(1 - left / max(measured, 1), "1")}
     write_json(report, content)
@@ -96,10 +99,6 @@ def fuse_depth_maps(
 def _all(stages: list[dict[str, Any]], name: str) -> str:
     """A word of all chunks' reports."""
     return ", ".join(sorted({value(stage, name) for stage in stages}))
-
-
-def _path(folder: Path, part: str, name: str) -> Path:
-    return folder / part / f"{name}.bin"
 
 
 def _report(cloud: Cloud, dropped: int, measured: int, stages: list[dict[str, Any]], unit: str) -> dict[str, Any]:
@@ -125,106 +124,77 @@ def _report(cloud: Cloud, dropped: int, measured: int, stages: list[dict[str, An
 
 
 def _fuse(
-    workspace: Path,
-    maps: Mapping[str, Path],
-    near: Mapping[str, list[str]],
-    settings: DenseCloudSettings,
-    beside: Path,
-) -> tuple[Cloud, int, int]:
-    """COLMAP's fusion of what is left of the maps after their vote, as a cloud with `views`; pixels before and after.
+    workspace: Path, maps: Mapping[str, Path], near: Mapping[str, list[str]], settings: DenseCloudSettings
+) -> tuple[Cloud, float, int, int]:
+    """A cloud with `views` of the pixels that enough maps confirm, the size of the finest map's pixels on the surface,
+    and how many pixels have a depth before and after the vote.
+
+    Where several maps show a place, the finest one gives its points.
 
     Args:
         workspace: that the maps belong to.
         maps: photo -> folder that its maps lie below.
         near: photo -> photos that vote on its map.
         settings: see DenseCloudSettings.
-        beside: path that COLMAP works beside.
-
-    Raises:
-        StageError: no point at all.
     """
-    largest = max(_path(folder, "depth_maps", name).stat().st_size for name, folder in maps.items()) // 4
-    photo = max(view.width * view.height for view in read_views(workspace / "sparse"))
-    # COLMAP follows a point through 50 photos. Bytes of a pixel: 16 of its depth and normal, 3 of the photo, which it
-    # keeps at its own size.
-    cached = MAX_PHOTOS * (16 * largest + 3 * photo)
-    widths = {name: _map_width(_path(folder, "depth_maps", name)) for name, folder in maps.items()}
-    with linked_workspace(workspace, beside, widths) as folder:
-        for name, source in maps.items():
-            link = folder / "stereo/normal_maps" / f"{name}.geometric.bin"
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.symlink_to(_path(source, "normal_maps", name).resolve())
-        measured, left = 0, 0
-        for name, before, depth in _voted(workspace, maps, near, settings):
-            write_depth(folder / "stereo/depth_maps" / f"{name}.geometric.bin", depth)
-            measured, left = measured + before, left + int((depth > 0).sum())
-        (folder / "stereo" / "fusion.cfg").write_text("".join(f"{name}\n" for name in sorted(maps)))
-        path = folder / "fused.ply"
-        fused = cancellable(
-            pycolmap.stereo_fusion, path, folder, "COLMAP", "option-all", "geometric", _options(settings, cached), "PLY"
-        )
-        if not path.is_file() or (fused is not None and fused.num_points3D() == 0 and path.stat().st_size < 1000):
-            raise _no_points(settings)
-        cloud, views = read_cloud(path), _read_visibility(path.with_suffix(".ply.vis"))
-    return Cloud(cloud.points, cloud.normals, cloud.colors, {"views": views}), measured, left
-
-
-def _options(settings: DenseCloudSettings, cached_bytes: int) -> pycolmap.StereoFusionOptions:
-    """COLMAP's own settings; cached_bytes: of the photos and maps that it keeps in memory."""
-    options = pycolmap.StereoFusionOptions()
-    options.num_threads = 1  # With more, which thread comes first decides the points.
-    options.min_num_pixels = settings.min_photos
-    options.max_reproj_error = settings.max_reprojection_px
-    options.max_depth_error = settings.max_depth_error
-    options.max_normal_error = settings.max_normal_error_deg
-    options.use_cache, options.cache_size = True, cached_bytes / 1e9
-    return options
-
-
-def _voted(
-    workspace: Path, maps: Mapping[str, Path], near: Mapping[str, list[str]], settings: DenseCloudSettings
-) -> Iterator[tuple[str, int, NDArray[np.float32]]]:
-    """Each photo, its number of depths, and its depths (H, W) that more maps confirm than see through."""
     cameras = {view.name: view for view in read_views(workspace / "sparse")}
-
-    @lru_cache(MAX_PHOTOS)
-    def depths(name: str) -> View:
-        pixels = read_depth(_path(maps[name], "depth_maps", name))
-        return replace(cameras[name].resized(pixels.shape[1], pixels.shape[0]), pixels=pixels)
-
+    near = {name: [other for other in near.get(name, []) if other in maps] for name in maps}
+    limits = settings.max_depth_error, settings.max_reprojection_px, settings.max_normal_error_deg
+    measured = lru_cache(MAX_PHOTOS)(lambda name: _read_map(cameras[name], workspace / "images", maps[name]))
+    confirmed: dict[str, NDArray[np.uint8]] = {}  # eight pixels in one number
+    pixel: dict[str, float] = {}
+    before, after = 0, 0
     for name in sorted(maps):
-        view = depths(name)
-        others = [depths(other) for other in near.get(name, []) if other in maps]
-        votes = vote(view, others, settings.max_depth_error, settings.max_reprojection_px)
+        own = measured(name)
+        votes = vote(own, map(measured, near[name]), *limits)
         stays = votes.agree > votes.through
         if settings.min_photos < 2:
             stays |= votes.through == 0
-        yield name, int((view.pixels > 0).sum()), np.where(stays, view.pixels, np.float32(0))
+        stays &= own.view.pixels > 0
+        before, after = before + int((own.view.pixels > 0).sum()), after + int(stays.sum())
+        stays &= votes.agree + 1 >= settings.min_photos
+        confirmed[name] = np.packbits(stays)
+        pixel[name] = float(np.median(own.view.pixels[stays])) / own.view.intrinsics[0, 0] if stays.any() else math.inf
+
+    def surface(name: str) -> DepthMap:
+        bits = np.unpackbits(confirmed[name], count=measured(name).view.pixels.size)
+        return _only(measured(name), bits > 0)
+
+    parts, place = [], {name: (pixel[name], name) for name in maps}
+    for name in sorted(maps, key=lambda name: place[name]):
+        own = surface(name)
+        finer = vote(own, (surface(other) for other in near[name] if place[other] < place[name]), *limits)
+        own = _only(own, finer.agree == 0)
+        parts.append(_points(own, vote(own, map(measured, near[name]), *limits)))
+    return concatenate(parts), min(pixel.values()), before, after
 
 
-def _no_points(settings: DenseCloudSettings) -> StageError:
-    """The error for maps that do not agree anywhere."""
-    return StageError(
-        f"no point is seen alike by {settings.min_photos} photos; lower scene.dense_cloud.min_photos, or check the"
-        " cameras"
+def _read_map(camera: View, photos: Path, folder: Path) -> DepthMap:
+    """The maps of one photo in a folder of depth_maps/ and normal_maps/, with its colours."""
+    depth, normals = (
+        read_depth(folder / f"depth_maps/{camera.name}.bin"),
+        read_normals(folder / f"normal_maps/{camera.name}.bin"),
     )
+    photo = replace(camera, pixels=read_rgb(photos / camera.name)).resized(*depth.shape[::-1])
+    turned = normals @ camera.cam_from_world[:3, :3].astype(np.float32)
+    return DepthMap(replace(photo, pixels=depth), turned, photo.pixels)
 
 
-def _map_width(path: Path) -> int:
-    """Width of a COLMAP map, from its header `width&height&channels&`."""
-    with open(path, "rb") as file:
-        return int(file.read(64).split(b"&")[0])
+def _only(whole: DepthMap, where: NDArray[Any]) -> DepthMap:
+    """A map without the depths elsewhere."""
+    depth = whole.view.pixels
+    return replace(whole, view=replace(whole.view, pixels=np.where(where.reshape(depth.shape), depth, np.float32(0))))
 
 
-def _read_visibility(path: Path) -> NDArray[np.uint16]:
-    """Photos per point, (N,), from COLMAP's .vis file: uint64 N, then per point uint32 n and n uint32 indices."""
-    words = np.fromfile(path, dtype=np.uint32)
-    count, position = int(words[:2].view(np.uint64)[0]), 2
-    views = np.empty(count, dtype=np.uint16)
-    for k in range(count):
-        views[k] = words[position]
-        position += 1 + int(words[position])
-    return views
+def _points(own: DepthMap, votes: Votes) -> Cloud:
+    """A point for each depth of a map, the mean of those that agree."""
+    rows, columns = np.nonzero(own.view.pixels > 0)
+    depth, normals, colors = np.split(votes.mean[rows, columns], [1, 4], axis=1)
+    points = back_project(depth[:, 0], own.view.intrinsics, own.view.world_from_cam, rows, columns)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Cloud(
+        points, normals, np.rint(colors).astype(np.uint8), {"views": votes.agree[rows, columns] + np.uint16(1)}
+    )
 
 
 def near_others(points: Array) -> NDArray[np.bool_]:
@@ -235,28 +205,3 @@ def near_others(points: Array) -> NDArray[np.bool_]:
     for rows in np.array_split(np.arange(len(points)), -(-len(points) // WHOLE)):
         distance[rows] = tree.query(points[rows], k=NEIGHBOURS + 1, workers=threads())[0][:, 1:].mean(1)
     return distance <= OUTLIER_RATIO * np.median(distance)
-
-
-@contextmanager
-def linked_workspace(workspace: Path, beside: Path, map_widths: Mapping[str, int]) -> Iterator[Path]:
-    """A temporary COLMAP workspace, removed afterwards: links to the photos, and shifted cameras.
-
-    COLMAP's dense part takes the first pixel's centre as 0, its sparse part as 0.5, so principal points move by half
-    a pixel of the map. With exact depth maps this takes the fused cloud from a quarter of a pixel's error to none.
-
-    Args:
-        workspace: with images/ and sparse/, PINHOLE cameras.
-        beside: path that it lies beside, on the file system of what comes out, so that maps can be moved there.
-        map_widths: width of the depth map of each photo, in pixels; photos of one camera have maps of one width.
-    """
-    model = read_model(workspace / "sparse")
-    widths = {image.camera_id: map_widths[image.name] for image in posed_images(model) if image.name in map_widths}
-    for camera in model.cameras.values():
-        half = 0.5 * camera.width / widths.get(camera.camera_id, camera.width)
-        fx, fy, cx, cy = camera.params
-        camera.params = [fx, fy, cx - half, cy - half]
-    with scratch_directory(beside) as folder:
-        (folder / "sparse").mkdir()
-        model.write_binary(folder / "sparse")
-        (folder / "images").symlink_to((workspace / "images").resolve())
-        yield folder

@@ -1,7 +1,8 @@
 """Depth maps of an undistorted COLMAP workspace, in chunks."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -12,13 +13,20 @@ import pycolmap
 import torch
 
 from scenefuse.core.machine import use_threads
-from scenefuse.core.stage import StageError, atomic_directory, manifest, quantity, threads, write_json
+from scenefuse.core.stage import (
+    StageError,
+    atomic_directory,
+    manifest,
+    quantity,
+    scratch_directory,
+    threads,
+    write_json,
+)
 from scenefuse.geometry.photo_check import MAX_PHOTOS
-from scenefuse.mvs.dense_cloud import linked_workspace
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.sparse_depths import Reference, select_views
 from scenefuse.photos.pictures import read_depth, write_depth, write_normals
-from scenefuse.photos.workspace import View, Workspace, read_workspace
+from scenefuse.photos.workspace import View, Workspace, posed_images, read_model, read_workspace
 from scenefuse.sfm.colmap import cancellable
 
 MAPS = ("depth_maps", "normal_maps")
@@ -176,3 +184,28 @@ def collect_maps(stereo: Path, names: Iterable[str], kind: str, output: Path) ->
                 raise StageError(f"COLMAP's patch-match left no {name}.{kind}.bin in {part}; look at the log")
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(source, target)
+
+
+@contextmanager
+def linked_workspace(workspace: Path, beside: Path, map_widths: Mapping[str, int]) -> Iterator[Path]:
+    """A temporary COLMAP workspace, removed afterwards: links to the photos, and shifted cameras.
+
+    COLMAP's dense part takes the first pixel's centre as 0, its sparse part as 0.5, so principal points move by half
+    a pixel of the map.
+
+    Args:
+        workspace: with images/ and sparse/, PINHOLE cameras.
+        beside: path that it lies beside, on the file system of what comes out, so that maps can be moved there.
+        map_widths: width of the depth map of each photo, in pixels; photos of one camera have maps of one width.
+    """
+    model = read_model(workspace / "sparse")
+    widths = {image.camera_id: map_widths[image.name] for image in posed_images(model) if image.name in map_widths}
+    for camera in model.cameras.values():
+        half = 0.5 * camera.width / widths.get(camera.camera_id, camera.width)
+        fx, fy, cx, cy = camera.params
+        camera.params = [fx, fy, cx - half, cy - half]
+    with scratch_directory(beside) as folder:
+        (folder / "sparse").mkdir()
+        model.write_binary(folder / "sparse")
+        (folder / "images").symlink_to((workspace / "images").resolve())
+        yield folder

@@ -26,7 +26,7 @@ from scenefuse.photos.workspace import View
 
 # Side of the windows that planes are fitted in, for depths and for normals: windows of 5 let the depths of single
 # pixels, off by half a step, turn normals by 12 degrees; larger ones lose small things.
-PLANE_PX, NORMAL_PX = 9, 11
+PLANE_PX = 9
 # The same where depths are already nearly right: smaller, since objects are curved.
 KNOWN_PLANE_PX = 7
 # Less than this, in NCC, is no better match: smooth surfaces match nearly everywhere. A match must be better than those
@@ -37,7 +37,7 @@ MIN_TEXTURE = 2 / 255
 # A match must be worse this far beside it, in pixels of the middle one of the source photos: a high correlation alone
 # says little, as a shaded wall matches at all depths.
 PEAK_DISTANCE_PX = 1.5
-# Largest share of blank pixels among those around that look alike, in windows of NORMAL_PX, twice over: the glow beside
+# Largest share of blank pixels among those around that look alike, in windows of PLANE_PX, twice over: the glow beside
 # an edge lies at the rim of a blank sky.
 MAX_BLANK_SHARE = 0.25
 
@@ -110,13 +110,15 @@ def estimate_depth(
         if level == 0:
             inverse, step = _sweep(matcher, 1 / far, 1 / near, settings)
         else:
-            inverse, step = _upsampled(inverse, first.width, first.height), step / 2
+            size = first.height, first.width
+            inverse = F.interpolate(inverse[None, None], size, mode="bilinear", align_corners=False)[0, 0]
+            step /= 2
         inverse, score = _refine(matcher, inverse, step, 1 / far, 1 / near)
     inverse, _ = _local_planes(inverse, score, PLANE_PX)
     inverse, score = _refine_once(matcher, inverse[None], step / 2)
-    _, slopes = _local_planes(inverse, score, NORMAL_PX)
+    _, slopes = _local_planes(inverse, score, PLANE_PX)
     normals = _normals(inverse, slopes, reference.intrinsics)
-    pixel = (1 / near - 1 / far) / max(matcher.middle_shift_per_inverse_depth(1 / far, 1 / near), 1e-6)
+    pixel = (1 / near - 1 / far) / max(float(np.median(matcher.shifts(1 / far, 1 / near))), 1e-6)
     good = is_measured(matcher, inverse, score, settings.min_score, pixel) & (inverse > 0.5 / far)
     best = 1 / inverse.clamp(min=1e-12)
     maps = torch.where(good, best, torch.zeros_like(best)), normals * good[..., None], score, best
@@ -142,7 +144,7 @@ def refine_by_matching(
     rows, columns = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     first = torch.from_numpy(1 / depth[rows, columns]).to(device)
     low, high = float(first.min()), float(first.max()) * 1.001
-    step = reach_px * (high - low) / max(matcher.shift_per_inverse_depth(low, high), 1e-6)
+    step = reach_px * (high - low) / max(*matcher.shifts(low, high), 1e-6)
     inverse, _ = _refine_once(matcher, first[None], step / 2)
     inverse, score = _refine(matcher, _median3(inverse), step / 4, low, high)
     inverse, _ = _local_planes(inverse, score, KNOWN_PLANE_PX)
@@ -158,7 +160,7 @@ def refine_by_matching(
 
 def _sweep(matcher: Matcher, low: float, high: float, settings: DepthMapSettings) -> tuple[Tensor, float]:
     """Inverse depth per pixel, (h, w), by a fronto-parallel sweep with semi-global smoothing, and the plane step."""
-    shift = matcher.shift_per_inverse_depth(low, high)
+    shift = max(matcher.shifts(low, high))
     count = int(np.clip(math.ceil(shift / 0.75), 16, settings.planes))
     planes = torch.linspace(low, high, count, device=matcher.reference.device)
     height, width = matcher.reference.shape
@@ -271,19 +273,11 @@ def _fit_planes(inverse, weight, window, fits):  # type: ignore[no-untyped-def]
                 rows[5, x + radius] += w * q * q
         # And over all: of w, w u, w v, w u u, w u v, w v v, w q, w q u, w q v, w q q.
         sums = np.zeros((10, width))
-        for k in range(window):
-            u = np.float64(k - radius)
-            for x in range(width):
-                sums[0, x] += rows[0, x + k]
-                sums[1, x] += rows[0, x + k] * u
-                sums[2, x] += rows[1, x + k]
-                sums[3, x] += rows[0, x + k] * u * u
-                sums[4, x] += rows[1, x + k] * u
-                sums[5, x] += rows[2, x + k]
-                sums[6, x] += rows[3, x + k]
-                sums[7, x] += rows[3, x + k] * u
-                sums[8, x] += rows[4, x + k]
-                sums[9, x] += rows[5, x + k]
+        for k, (row, power) in enumerate(zip((0, 0, 1, 0, 1, 2, 3, 3, 4, 5), (0, 1, 0, 2, 1, 0, 0, 1, 0, 0))):
+            for u in range(-radius, radius + 1):
+                share = np.float64(u) ** power
+                for x in range(width):
+                    sums[k, x] += share * rows[row, x + u + radius]
         for x in range(width):
             w = sums[0, x]
             mu, mv, mq = sums[1, x] / w, sums[2, x] / w, sums[6, x] / w
@@ -327,11 +321,6 @@ def _normals(inverse: Tensor, slopes: Tensor, intrinsics: Array) -> Tensor:
     return -F.normalize(n, dim=-1)
 
 
-def _upsampled(inverse: Tensor, width: int, height: int) -> Tensor:
-    """(h, w) to (height, width), bilinear."""
-    return F.interpolate(inverse[None, None], size=(height, width), mode="bilinear", align_corners=False)[0, 0]
-
-
 def _median3(values: Tensor) -> Tensor:
     """Median over 3x3 pixels of an (h, w) map."""
     return torch.from_numpy(cv2.medianBlur(values.cpu().numpy(), 3)).to(values.device)
@@ -356,7 +345,7 @@ def is_measured(matcher: Matcher, inverse: Tensor, score: Tensor, min_score: flo
 
 def _among_blank(matcher: Matcher, measured: Tensor) -> Tensor:
     """True (h, w) where of the pixels around that look alike too many have neither texture nor a measurement."""
-    weights = support_weights(matcher.reference, NORMAL_PX)
+    weights = support_weights(matcher.reference, PLANE_PX)
     known, blank = measured.float(), (~measured & (matcher.variance < NOISE_VARIANCE)).float()
     for _ in range(2):
         known, blank = (supported_mean(values, weights) for values in (known, blank))

@@ -29,7 +29,7 @@ from scenefuse.photos.views import Views, load_views
 # Depth maps: the scene's settings, and a smaller window. Of seven variants on the house at half the width (score,
 # window, angle, sources, best sources) only the window changed much.
 DEPTH: dict[str, dict[str, Any]] = {"window 7": {}, "window 5": {"window_px": 5}}
-# Their fusion: COLMAP's as for the scene; stricter, since the photos are near; the same with two photos instead of
+# Their fusion: as for the scene; stricter, since the photos are near; the same with two photos instead of
 # three; and that of the object's cloud.
 STRICT = {"max_depth_error": 0.005, "max_reprojection_px": 1}
 FUSION: dict[str, dict[str, Any] | None] = {
@@ -180,7 +180,7 @@ def object_mvs(
     """Print the clouds of multi-view stereo and of the four stages; all trials go to bench/object_mvs.tsv.
 
     Multi-view stereo is the scene's own (plane sweep and slanted refinement, or COLMAP's patch-match with CUDA;
-    COLMAP's fusion) at the width of the NeRF, on all photos; its depths off the mask are dropped before fusion, its
+    its fusion) at the width of the NeRF, on all photos; its depths off the mask are dropped before fusion, its
     points off the masks after, and it is thinned and cleaned like the object's cloud. The best trial by F at 1 % is
     marked. Beside them stand clouds of the maps of stages 1 and 3, made in the same way.
 

@@ -191,28 +191,6 @@ def test_a_cloud_of_few_of_the_measured_pixels_is_noted(workspace, maps, tmp_pat
     assert "of the pixels with a depth are in the cloud" in value(report, "notes")[0]
 
 
-def test_what_colmap_keeps_in_memory_is_room_for_photos_that_are_larger_than_their_maps(
-    workspace, tmp_path, monkeypatch
-):
-    small, kept, fusion = replace(DEPTH, max_image_size_px=80), [], pycolmap.stereo_fusion
-    monkeypatch.setattr(dense_cloud, "MAX_PHOTOS", 5)
-    monkeypatch.setattr(
-        pycolmap, "stereo_fusion", lambda *w, **more: kept.append(w[5].cache_size) or fusion(*w, **more)
-    )
-    maps = {"depth": tmp_path / "maps", "report": tmp_path / "maps.json"}
-    estimate_depth_maps(workspace=workspace, chunk=0, chunks=1, settings=small, seed=0, **maps)
-    fuse_depth_maps(
-        workspace=workspace,
-        depth=[maps["depth"]],
-        depth_json=[maps["report"]],
-        settings=FUSION,
-        cloud=tmp_path / "dense.ply",
-        report=tmp_path / "dense.json",
-    )
-    of_photo, of_maps = 3 * WIDTH * HEIGHT, (1 + 3) * 4 * (WIDTH // 2) * (HEIGHT // 2)
-    assert kept == [pytest.approx(5 * (of_photo + of_maps) / 1e9, rel=1e-3)]  # with the header of a map
-
-
 def test_a_point_far_from_all_others_is_found_in_clouds_of_any_size(monkeypatch):
     points = np.random.default_rng(0).uniform(0, [100, 20, 1], (5000, 3))
     points[7] = [50, 90, 0]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scenefuse.geometry.consistency import neighbours, vote
+from scenefuse.geometry.consistency import DepthMap, neighbours, vote
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.photos.workspace import View
 
@@ -105,16 +105,25 @@ def test_a_textured_wall_keeps_its_depth():
     assert np.quantile(angle[wall & (estimate.depth > 0)], 0.9) < 8
 
 
+LIMITS = {"max_depth_error": 0.01, "max_reprojection_px": 2.0, "max_normal_error_deg": 30.0}
+
+
+def with_depths(planted, depths):
+    return replace(planted, view=replace(planted.view, pixels=depths.astype(np.float32)))
+
+
 def planted_maps():
-    """Views of the card before the wall with their true depths, (H, W) float32."""
+    """Maps of the card before the wall with their true depths; they face the cameras, in a grey of each photo's own."""
     views, _ = photos(texture(0, 0.05, 0.35), texture(1, 0.55, 0.75))
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     maps = []
-    for view in views:
+    for k, view in enumerate(views):
         x = view.centre[0] + (u - WIDTH / 2) / FOCAL * CARD
         y = view.centre[1] + (v - HEIGHT / 2) / FOCAL * CARD
         card = (np.abs(x) < HALF[0]) & (np.abs(y) < HALF[1])
-        maps.append(replace(view, pixels=np.where(card, CARD, WALL).astype(np.float32)))
+        normals, colors = np.zeros((HEIGHT, WIDTH, 3), np.float32), np.full((HEIGHT, WIDTH, 3), 10 * k, np.uint8)
+        normals[..., 2] = -1
+        maps.append(with_depths(DepthMap(view, normals, colors), np.where(card, CARD, WALL)))
     return maps
 
 
@@ -122,13 +131,28 @@ def test_depth_maps_confirm_what_is_there_and_see_through_what_floats():
     maps = planted_maps()
     floating = np.zeros((HEIGHT, WIDTH), bool)
     floating[20:30, 20:30] = True
-    first = replace(maps[0], pixels=np.where(floating, np.float32(CARD), maps[0].pixels))
-    votes = vote(first, maps[1:], 0.01, 2.0)
+    first = with_depths(maps[0], np.where(floating, CARD, maps[0].view.pixels))
+    votes = vote(first, maps[1:], **LIMITS)
     assert (votes.through > votes.agree)[floating].all()
     solid = inner(40) & ~floating
     assert (votes.agree > votes.through)[solid].mean() > 0.999
     # What others cannot see is no vote against it: the wall just behind the card's edge.
     assert votes.through[~floating].max() == 0
+
+
+def test_a_place_has_the_mean_of_the_maps_that_agree_on_it_and_no_map_agrees_on_a_surface_that_faces_elsewhere():
+    first, *others = planted_maps()
+    farther = [with_depths(m, 1.005 * m.view.pixels) for m in others[:2]]
+    wall = np.zeros((HEIGHT, WIDTH), bool)
+    wall[10:30, 80:120] = True
+    votes = vote(first, farther, **LIMITS)
+    assert (votes.agree[wall] == 2).all()
+    mean = votes.mean[wall]
+    assert np.allclose(mean, [WALL * (1 + 2 * 0.005 / 3), 0, 0, -1, 10, 10, 10], rtol=2e-4)
+    turned = [replace(m, normals=np.roll(m.normals, 1, axis=2)) for m in farther]
+    votes = vote(first, turned, **LIMITS)
+    assert not votes.agree.any() and not votes.through[wall].any()
+    assert np.array_equal(votes.mean[..., 0], first.view.pixels)
 
 
 def test_a_photo_is_judged_by_those_that_it_was_matched_with_and_that_were_matched_with_it():

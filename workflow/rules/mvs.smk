@@ -42,7 +42,7 @@ rule estimate_depth_maps:
 
 
 rule fuse_depth_maps:
-    """Fuse the depth maps into one cloud by COLMAP's stereo fusion."""
+    """Fuse the depth maps into one cloud."""
     input:
         workspace="results/scenes/{scene}/undistorted",
         georeference_json="results/scenes/{scene}/georeference.json",
