@@ -18,14 +18,14 @@ from scenefuse.sfm.matches import MatchSettings
 # Bytes that a feature takes in both databases of a model, with its matches; a pixel of a photo in its copies as JPEG; a
 # pixel of a scene's depth, normal and confidence maps, with its share of the clouds; a pixel of an object's maps of
 # stages 1 to 4, with its share of the registration and the pictures. Fitted to what the demo took (docs/results.md).
-BYTES = {"feature": 450, "photo": 2, "scene": 19, "object": 60}
+BYTES = {"feature": 450, "photo": 2, "scene": 24, "object": 60}
 # Seconds of one core, fitted to the demo's benchmarks. A job's start with its small work.
 JOB_S = 4.0
 # A megapixel that is searched for features, enlarged ones too; two photos, times the features of both; a photo in the
 # mapping, times its features.
 FEATURES_S, PAIR_S, MAPPING_S = 0.3, 6e-9, 7e-4
 # A megapixel of a scene's depth maps, and one of any maps in each job that reads them.
-STEREO_S, MAPS_S = 6.5, 1.5
+STEREO_S, MAPS_S = 3.5, 1.5
 MAP_READERS = {
     "scene": ("fuse_depth_maps", "estimate_scene_spread"),
     "object": ("refine_depth", "make_object_cloud", "fuse_object", "find_missing"),
