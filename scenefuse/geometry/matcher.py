@@ -59,13 +59,10 @@ class Matcher:
             source_from_reference = source.cam_from_world @ reference.world_from_cam
             # From pixels to grid_sample's -1..1, where 0.5 px is the first pixel's centre.
             to_grid = np.array([[2 / source.width, 0, -1], [0, 2 / source.height, -1], [0, 0, 1]]) @ source.intrinsics
-            turn = to_grid @ source_from_reference[:3, :3] @ np.linalg.inv(reference.intrinsics)
-            camera = (
-                torch.from_numpy(part.astype(np.float32)) for part in (turn, to_grid @ source_from_reference[:3, 3])
-            )
-            self.sources.append(
-                (torch.from_numpy(_centred(source.pixels))[None, None].to(device), *(c.to(device) for c in camera))
-            )
+            camera = to_grid @ source_from_reference[:3]
+            parts = camera[:, :3] @ np.linalg.inv(reference.intrinsics), camera[:, 3]
+            turn, move = (torch.from_numpy(part.astype(np.float32)).to(device) for part in parts)
+            self.sources.append((torch.from_numpy(_centred(source.pixels))[None, None].to(device), turn, move))
 
     def score(self, inverse: Tensor) -> Tensor:
         """Mean NCC of the best sources for D hypotheses per pixel: (D, h, w) inverse depths -> (D, h, w) in -1..1."""

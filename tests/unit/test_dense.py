@@ -182,7 +182,7 @@ def test_a_cloud_of_few_of_the_measured_pixels_is_noted(workspace, maps, tmp_pat
         workspace=workspace,
         depth=[maps / "0", maps / "1"],
         depth_json=[maps / "0.json", maps / "1.json"],
-        settings=replace(FUSION, max_reprojection_px=0.05, max_depth_error=1e-4),
+        settings=replace(FUSION, max_reprojection_px=0.05, max_depth_error=2e-5),
         cloud=tmp_path / "dense.ply",
         report=tmp_path / "dense.json",
     )
