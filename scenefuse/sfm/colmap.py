@@ -145,6 +145,13 @@ class Explained:
         """Matches that the model explains."""
         return int(self.explained.sum())
 
+    def can_grow(self) -> bool:
+        """Whether a photo outside the model has as many matches with its photos as COLMAP needs to place one."""
+        inside = np.isin(self.pairs, self.pairs[self.placed])
+        one = inside.sum(1) == 1
+        outside = np.bincount(self.pairs[one][~inside[one]], self.matches[one])
+        return bool((outside >= STRONG_PAIR).any())
+
     def shares(self) -> dict[int, float]:
         """Of each photo in strong pairs of the model's photos, the share of their matches that the model explains."""
         strong = (self.matches >= STRONG_PAIR) & self.placed

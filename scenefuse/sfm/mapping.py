@@ -211,10 +211,11 @@ def _attempt(job: Job, calibrated: bool, seed: int) -> tuple[pycolmap.Reconstruc
 def _mapped_first(job: Job, calibrated: bool, seed: int) -> tuple[list[pycolmap.Reconstruction], int]:
     """Models from strong pairs alone, or, where these explain more, from all that were verified; fewest matches used.
 
-    Pairs that chance verified put photos in wrong places; but some photos have no other pairs.
+    Pairs that chance verified put photos in wrong places; but some photos have no other pairs. Photos of something else
+    have none at all.
     """
     strong = _models(job, _mapper_options(job, calibrated, seed, STRONG_PAIR))
-    if strong and strong[0].num_reg_images() == len(job.names):
+    if strong and not explained_matches(strong[0], job.database).can_grow():
         return strong, STRONG_PAIR
     options = _mapper_options(job, calibrated, seed)
     every = _models(job, options)
@@ -266,12 +267,13 @@ def _with_lens(
     """Models with the lens that the first was found to have, and how many mappings they took.
 
     The first model's points are triangulated again, for a poorer lens splits tracks and drops matches. It may also have
-    left photos out, or put them at wrong places, where an adjustment leaves them: then photos are mapped again.
+    left out photos with matches, or put some at wrong places, where an adjustment leaves them: then photos are mapped
+    again.
     """
     model = lens.fit(ranked[0])
     found = explained_matches(model, job.database)
     with _calibrated(model, job) as database:
-        if model.num_reg_images() == len(job.names) and not doubtful_photos(model, found):
+        if not found.can_grow() and not doubtful_photos(model, found):
             folders = job.folder, database.parent
             return [cancellable(pycolmap.triangulate_points, model, database, *folders, options=options)], 1
         again = _models(job, options, database)

@@ -564,18 +564,30 @@ def test_weak_pairs_are_not_used_where_strong_ones_do(tmp_path):
     assert value(report, "doubtful_photos") == {}
 
 
-@pytest.mark.parametrize(("missing", "mappings"), [((), 1), (("extra.jpg",), 3)])
-def test_photos_are_mapped_again_with_the_lens_that_was_found_where_some_are_missing(
-    tmp_path, monkeypatch, missing, mappings
+@pytest.mark.parametrize(
+    ("missing", "weak", "mappings"), [((), None, 1), (("something_else.jpg",), None, 1), ((), 8, 3)]
+)
+def test_photos_are_mapped_again_with_the_lens_that_was_found_where_some_with_matches_are_missing(
+    tmp_path, monkeypatch, missing, weak, mappings
 ):
-    small_capture(tmp_path, more=missing)
+    small_capture(tmp_path, weak, missing)
+    if weak is not None:
+        with pycolmap.Database.open(tmp_path / "database.db") as database:
+            for other in range(1, weak):
+                geometry = database.read_two_view_geometry(other, weak)
+                wrong = np.array(geometry.inlier_matches)
+                wrong[:, 1] = np.roll(wrong[:, 1], 1)
+                geometry.inlier_matches = wrong
+                database.update_two_view_geometry(other, weak, geometry)
     calls, incremental = [], pycolmap.incremental_mapping
     monkeypatch.setattr(mapping, "choose_lens", lambda *_: Choice(CENTRED, None))
     monkeypatch.setattr(
         pycolmap, "incremental_mapping", lambda *a, **options: calls.append(a) or incremental(*a, **options)
     )
     report = mapped(tmp_path)
-    assert (value(report, "registered"), value(report, "lens"), len(calls)) == (8, "centred", mappings)
+    assert (value(report, "lens"), len(calls)) == ("centred", mappings)
+    assert value(report, "registered") == 8 - (weak is not None)
+    assert set(missing) <= set(value(report, "not_registered"))
     assert value(report, "mean_reprojection_error_px") < 0.5
 
 
