@@ -11,7 +11,7 @@ import webbrowser
 from collections.abc import Iterable, Sequence
 from itertools import takewhile
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -31,17 +31,22 @@ Preset = Literal["draft", "normal", "high"]
 Folder = tyro.conf.Positional[Path]
 
 
+def _shown(metavar: str | None = None) -> Any:
+    """How the help shows an argument: under this name, without its default."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+
+
 def complete(
-    flight: Annotated[Folder, tyro.conf.arg(metavar="FLIGHT")],
-    house: Annotated[Folder, tyro.conf.arg(metavar="HOUSE")],
-    others: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[SHED ...]")] = (),
+    flight: Annotated[Folder, _shown("FLIGHT")],
+    house: Annotated[Folder, _shown("HOUSE")],
+    others: Annotated[tyro.conf.Positional[tuple[Path, ...]], _shown("[SHED ...]")] = (),
     *,
-    out: Path | None = None,
-    prompts: tuple[Path, ...] = (),
-    masks: tuple[Path, ...] = (),
+    out: Annotated[Path | None, _shown("FOLDER")] = None,
+    prompts: Annotated[tuple[Path, ...], _shown("FILE ...")] = (),
+    masks: Annotated[tuple[Path, ...], _shown("FOLDER ...")] = (),
     preset: Preset = "normal",
-    cores: int | None = None,
-    no_browser: Annotated[tyro.conf.UseCounterAction[int], tyro.conf.arg(help_behavior_hint="")] = 0,
+    cores: Annotated[int | None, _shown("N")] = None,
+    no_browser: Annotated[tyro.conf.UseCounterAction[int], _shown()] = 0,
 ) -> None:
     """Complete objects in a drone reconstruction: makes a project, opens the page to click on each object, runs the
     workflow, and opens the report. The same command again goes on where it was left.
@@ -89,8 +94,8 @@ def _make_or_go_on(project: Path, flight: Path, objects: Sequence[Path], preset:
             held = there.get(row[kind], {})
             if any(held.get(key) != row[key] for key in row if key != "prompts"):
                 raise StageError(
-                    f"{project} holds another project, whose {kind}s are: {', '.join(there)}; give another folder by"
-                    f" --out, or add {row[kind]} to {project / table} and use scenefuse run in {project}"
+                    f"{project} holds another project ({kind}s: {', '.join(there)}); delete it, give another folder by"
+                    f" --out, or add {row[kind]} to {project / table} and use scenefuse run there"
                 )
     print(f"Going on with {project}", flush=True)
 

@@ -13,6 +13,7 @@ from scenefuse.cloud.formats import READERS
 from scenefuse.core.settings import OWN_SETTINGS, PACKAGE, ROOT, schema_of
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.tables import Row, read_table
+from scenefuse.core.transforms import FIXING_POINTS
 from scenefuse.photos.photo_files import VIDEO_SUFFIXES, in_folders, photo_files
 
 SCENES, OBJECTS = Path("config/scenes.tsv"), Path("config/objects.tsv")
@@ -72,11 +73,12 @@ def make_project(folder: Path, scene: Path | None, objects: Sequence[Path], pres
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
     for path in [*([] if scene is None else [scene]), *objects]:
-        if path.is_dir():
-            print(f"{path} holds {in_folders([f.relative_to(path).as_posix() for f in photo_files(path)])}", flush=True)
         name = default_name(path)
-        renamed = "" if name == _stem(path) else "; names hold only A-Z, a-z, 0-9, _ and -"
-        print(f"{path} is called {name} in the tables and results{renamed}", flush=True)
+        said = "the scene" if path is scene else "an object"
+        said += "" if name == _stem(path) else f", called {name} (names hold only A-Z, a-z, 0-9, _ and -)"
+        if path.is_dir():
+            said += f", {in_folders([f.relative_to(path).as_posix() for f in photo_files(path)])}"
+        print(f"{path}: {said}", flush=True)
     return rows
 
 
@@ -86,6 +88,8 @@ def project_rows(folder: Path, scene: Path | None, objects: Sequence[Path]) -> d
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise StageError(f"two objects would be called '{twice}'; rename one of their folders or files")
+    if scene is not None and scene.resolve() in (path.resolve() for path in objects):
+        raise StageError(f"{scene} is given as the scene and as an object; give the object's own photos")
     scene_name = "" if scene is None else default_name(scene)
     scenes = [] if scene is None else [{"scene": scene_name} | _source(scene, folder, video=False)]
     rows = [
@@ -127,7 +131,8 @@ def _source(path: Path, folder: Path, *, video: bool) -> dict[str, str]:
     if path.is_dir():
         if folder.resolve().is_relative_to(path.resolve()):
             raise StageError(f"the project {folder} would lie among its photos in {path}; give a folder of its own")
-        photo_files(path)
+        if (count := len(photo_files(path))) < FIXING_POINTS:
+            raise StageError(f"{path} holds {count} {'photo' if count == 1 else 'photos'}; cameras need three or more")
     elif not (is_cloud or (video and suffix in VIDEO_SUFFIXES)):
         raise StageError(f"{path} is not {wanted.replace('or a', 'nor a')} ({', '.join(READERS)})")
     elif path.stat().st_size == 0:

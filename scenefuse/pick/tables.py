@@ -31,8 +31,8 @@ FEW_FEATURES = "Needed only where the photos of object and scene share too few f
 LENGTH = "Write the name and the metres of a length that you know, and click its two ends, each in two or more photos."
 # What to do, by the column that names the table and its kind.
 ADVICE: dict[tuple[str, Kind], str] = {
-    ("prompts", "labels"): "Click each part of the object, and beside it where something like it touches it. One photo"
-    " is enough to begin with.",
+    ("prompts", "labels"): "Click each part of the object in one photo, about five times. Where the mask holds more,"
+    " click there as outside.",
     ("prompts", "points"): "Mark at least four points on the object that span it, each in two or more photos.",
     ("fiducials", "labels"): f"{FEW_FEATURES}Click the object's ends, top and foot in one photo, and what it touches as"
     " outside.",

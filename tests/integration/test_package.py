@@ -187,13 +187,13 @@ def test_names_are_made_of_what_files_are_called_and_said(tmp_path, monkeypatch,
         Path(name).write_bytes(b"cloud")
     init(Path("new"), scene=Path("site.laz"), objects=(Path("Häuschen neu.ply"),))
     said = capsys.readouterr().out
-    assert "Häuschen neu.ply is called Hauschen_neu in the tables and results; names hold only" in said
-    assert "site.laz is called site in the tables and results\n" in said
+    assert "Häuschen neu.ply: an object, called Hauschen_neu (names hold only" in said
+    assert "site.laz: the scene\n" in said
     for name in ("a.jpg", "b.jpg", "small/a.jpg"):
         Path("shots", name).parent.mkdir(parents=True, exist_ok=True)
         Path("shots", name).write_bytes(b"photo")
     init(Path("other"), objects=(Path("shots"),))
-    assert "shots holds 3 photos, 1 of them in small/\n" in capsys.readouterr().out
+    assert "shots: an object, 3 photos, 1 of them in small/\n" in capsys.readouterr().out
     assert "Hauschen_neu\tsite\t" in Path("new/config/objects.tsv").read_text()
 
 

@@ -75,7 +75,7 @@ def test_the_same_command_goes_on_and_other_folders_are_another_project(two_fold
     run("close")
     assert "Going on with flight_completed" in capsys.readouterr().out
     Project(two_folders).photos("shed")
-    with pytest.raises(StageError, match="flight_completed holds another project, whose objects are: close; give"):
+    with pytest.raises(StageError, match=r"flight_completed holds another project \(objects: close\); delete it, give"):
         run("close", "shed")
 
 
@@ -111,10 +111,17 @@ def test_what_cannot_be_used_is_one_sentence(two_folders, options, sentence):
         run("close", **options)
 
 
-def test_a_folder_without_photos_is_one_sentence(two_folders):
+def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
     (two_folders / "empty").mkdir()
-    with pytest.raises(StageError, match="the photo folder empty holds no photos"):
-        run("empty")
+    Project(two_folders).photos("one", 1)
+    for folder, sentence in (
+        ("empty", "the photo folder empty holds no photos"),
+        ("one", "one holds 1 photo; cameras need three or more"),
+        ("flight", "flight is given as the scene and as an object"),
+    ):
+        with pytest.raises(StageError, match=sentence):
+            run(folder)
+    assert not (two_folders / "flight_completed").exists()
 
 
 @pytest.mark.parametrize(
