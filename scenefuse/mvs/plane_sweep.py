@@ -26,7 +26,7 @@ from scenefuse.photos.workspace import View
 
 # Side of the windows that planes are fitted in, for depths and for normals: windows of 5 let the depths of single
 # pixels, off by half a step, turn normals by 12 degrees; larger ones lose small things.
-PLANE_PX = 9
+PLANE_PX, NORMAL_PX = 9, 11
 # The same where depths are already nearly right: smaller, since objects are curved.
 KNOWN_PLANE_PX = 7
 # Less than this, in NCC, is no better match: smooth surfaces match nearly everywhere. A match must be better than those
@@ -37,7 +37,7 @@ MIN_TEXTURE = 2 / 255
 # A match must be worse this far beside it, in pixels of the middle one of the source photos: a high correlation alone
 # says little, as a shaded wall matches at all depths.
 PEAK_DISTANCE_PX = 1.5
-# Largest share of blank pixels among those around that look alike, in windows of PLANE_PX, twice over: the glow beside
+# Largest share of blank pixels among those around that look alike, in windows of NORMAL_PX, twice over: the glow beside
 # an edge lies at the rim of a blank sky.
 MAX_BLANK_SHARE = 0.25
 
@@ -116,7 +116,7 @@ def estimate_depth(
         inverse, score = _refine(matcher, inverse, step, 1 / far, 1 / near)
     inverse, _ = _local_planes(inverse, score, PLANE_PX)
     inverse, score = _refine_once(matcher, inverse[None], step / 2)
-    _, slopes = _local_planes(inverse, score, PLANE_PX)
+    _, slopes = _local_planes(inverse, score, NORMAL_PX)
     normals = _normals(inverse, slopes, reference.intrinsics)
     pixel = (1 / near - 1 / far) / max(float(np.median(matcher.shifts(1 / far, 1 / near))), 1e-6)
     good = is_measured(matcher, inverse, score, settings.min_score, pixel) & (inverse > 0.5 / far)
@@ -345,7 +345,7 @@ def is_measured(matcher: Matcher, inverse: Tensor, score: Tensor, min_score: flo
 
 def _among_blank(matcher: Matcher, measured: Tensor) -> Tensor:
     """True (h, w) where of the pixels around that look alike too many have neither texture nor a measurement."""
-    weights = support_weights(matcher.reference, PLANE_PX)
+    weights = support_weights(matcher.reference, NORMAL_PX)
     known, blank = measured.float(), (~measured & (matcher.variance < NOISE_VARIANCE)).float()
     for _ in range(2):
         known, blank = (supported_mean(values, weights) for values in (known, blank))
