@@ -60,7 +60,7 @@ class MatchSettings:
 
     pairs: Literal["auto", "exhaustive", "spatial", "sequential"] = setting("auto")
     """Pairs of photos that are compared; auto: by GPS where most photos have it, in sequence for a video, all pairs of
-    a small set, else in sequence."""
+    a small set, else in sequence and by likeness."""
     exhaustive_up_to: int = 200
     """Auto compares all pairs up to this many photos."""
     max_ratio: float = setting(0.7, above=0)
@@ -75,7 +75,8 @@ class MatchSettings:
     overlap: int = 10
     """Sequential: following photos that each photo is compared with."""
     loop_every: int = 5
-    """Sequential: every n-th photo is compared with every other n-th photo, which closes loops."""
+    """Sequential: every n-th photo is compared with every other n-th photo, which closes loops; of more than
+    `exhaustive_up_to` photos each one with `neighbours` that look alike."""
 
 
 def match_features(
