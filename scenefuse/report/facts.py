@@ -43,7 +43,7 @@ def object_facts(row: Row) -> dict[str, str]:
         why = WORDS["decided_by"].get(has.get("decided_by", ""))
     facts["Result"] = WORDS["results"][status] + (f": {why}" if why else "")
     if status == ALONE:
-        facts["File"] = f"objects/{has['object']}/object.ply"
+        facts["File"] = f"results/objects/{has['object']}/object.ply"
     if status == "unregistered":
         facts["Result"] += ". Perhaps it is not in this scene, or too little of it"
     if "height" in has:
@@ -67,7 +67,7 @@ def object_facts(row: Row) -> dict[str, str]:
     if "registered" in has and "frames" in has:
         facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used"
     if "added_points" in has:
-        facts["File"] = f"objects/{has['object']}/fused.ply; in the scene: completed.ply"
+        facts["File"] = f"results/objects/{has['object']}/fused.ply; in the scene: completed.ply"
     return _capital(facts | _next(has))
 
 
@@ -87,8 +87,8 @@ def surface_facts(folder: Path) -> dict[str, str]:
     shares = ", ".join(
         f"{percent(value(found, kind))} {kind}" for kind in ("measured", "unconfirmed", "bridged", "open")
     )
-    drawings = f", objects/{folder.name}/drawings/drawings.pdf" if (folder / "drawings").is_dir() else ""
-    return {"Mesh": f"With the ground around it {shares}; objects/{folder.name}/surface.glb{drawings}"}
+    drawings = f", results/objects/{folder.name}/drawings/drawings.pdf" if (folder / "drawings").is_dir() else ""
+    return {"Mesh": f"With the ground around it {shares}; results/objects/{folder.name}/surface.glb{drawings}"}
 
 
 def _accuracy(has: dict[str, Any], unit: str) -> dict[str, str]:
@@ -113,9 +113,8 @@ def _next(has: dict[str, Any]) -> dict[str, str]:
             else ""
         )
         places = "place" if has["stations"] == 1 else "places"
-        parts.append(
-            f"photograph it from {has['stations']:.0f} {places} (objects/{has['object']}/next_photos.csv){shows}"
-        )
+        table = f"results/objects/{has['object']}/next_photos.csv"
+        parts.append(f"photograph it from {has['stations']:.0f} {places} ({table}){shows}")
     if "advice" in has:
         parts.append(has["advice"])
     return {"Next": "; ".join(parts)} if parts else {}
@@ -152,7 +151,7 @@ def scene_facts(row: Row) -> dict[str, str]:
     if errors:
         facts["Residuals"] = "; ".join(errors)
     if "completed_points" in has:
-        file = f"scenes/{has['scene']}/completed"
+        file = f"results/scenes/{has['scene']}/completed"
         facts["File"] = f"{file}.copc.laz" + (
             f" in the CRS; {file}.ply from a local origin" if "crs" in has else f", {file}.ply"
         )

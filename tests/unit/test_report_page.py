@@ -341,7 +341,7 @@ QUESTIONS = {
     "how many photos?": "40 of 40 used",
     "may I trust the scale?": r"its scale in the scene is known to 0\.1 %",
     "where is the file?": r"objects/house/fused\.ply",
-    "what next?": r"photograph it from 4 places \(objects/house/next_photos\.csv\)",
+    "what next?": r"photograph it from 4 places \(results/objects/house/next_photos\.csv\)",
     "who made it?": r"Made by scenefuse \d",
 }
 SHOWN = """

@@ -217,7 +217,7 @@ def test_the_text_says_what_psnr_was_measured_on_and_what_the_completed_scene_ho
     text = " ".join((summarise(results, ["house", "balloon"]) / "details.txt").read_text().split())
     assert "PSNR 27.5 dB, measured on training photos" in text and "held-out" not in text
     assert "Completed with house; 5,030 points" in text
-    assert "scenes/demo/completed.copc.laz, scenes/demo/completed.ply" in text
+    assert "results/scenes/demo/completed.copc.laz, results/scenes/demo/completed.ply" in text
     assert "completed.copc" not in (summarise(results) / "details.txt").read_text()
 
 
@@ -459,7 +459,7 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
         "11.4 m × 9.96 m, 8.10 m high",
         "98.2 % is there, 1.8 % is missing: 1.0 % seen by no photo, 0.8 % where photos disagree",
         "Standard deviation of a point 7.20 mm on the object and 13.1 mm in the scene",
-        "Photograph it from 3 places (objects/house/next_photos.csv): this would show 77 % of what no photo",
+        "Photograph it from 3 places (results/objects/house/next_photos.csv): this would show 77 % of what no photo",
     ):
         assert sentence in " ".join(text.split()) and sentence in card, sentence
     assert "Not added to the scene: weak. Perhaps it is not in this scene" in text
@@ -504,7 +504,7 @@ def test_a_run_ends_in_three_lines(results):
     write_json(results / "objects/house/missing.json", {"stations": quantity(1, "")})
     result, page, following = closing_lines(summarise(results, ["house"])).splitlines()
     assert result.startswith("Result: 1 of 1 objects completed; ") and result.endswith("scenes/demo/completed.ply")
-    assert following == "Next:   house: Photograph it from 1 place (objects/house/next_photos.csv)"
+    assert following == "Next:   house: Photograph it from 1 place (results/objects/house/next_photos.csv)"
 
 
 def test_shares_and_lengths_are_written_as_people_do():
