@@ -19,6 +19,7 @@ from scenefuse.fuse.fuse_object import photos_of
 from scenefuse.fuse.measure import RESOLUTION, with_normals
 from scenefuse.fuse.missing import NEAR, Lack, Missing, Plan, find_missing_surface, plan_stations, reach_of_stations
 from scenefuse.fuse.modes import around
+from scenefuse.fuse.surroundings import missing_ground
 from scenefuse.fuse.write import added_by, read_changes, together
 from scenefuse.geometry.photo_check import Photos
 from scenefuse.photos.geodesy import GridFrame, LocalFrame, length_unit, scene_frame
@@ -109,6 +110,9 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     _write_geojson(outputs.geojson, rows)
     higher = {row["station"] for row in rows if row["above_close_ups"] > 0}
     content = _report(missing, plan, unit) | {"stations_above_close_ups": quantity(len(higher), "")}
+    cells, share = missing_ground(obj, near, photos)
+    content |= {"ground_cells": quantity(cells, "cells")}
+    content |= {"ground_missing": quantity(share, "of the ground beside it that photos show")}
     content |= {"of": quantity("its surface" if masks else "what its own cloud holds", "")}
     content |= {"seconds": quantity(time.perf_counter() - start, "s")}
     write_json(outputs.report, content)

@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing, write_cloud
 from scenefuse.cloud.tiled_cloud import Rows, open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
 from scenefuse.fuse.compare import REASONS, Reason
-from scenefuse.fuse.measure import Evidence, unchecked
+from scenefuse.fuse.measure import Evidence, deviations_of_pose, unchecked
 from scenefuse.fuse.modes import (
-    NEAR,
     Checked,
     Fused,
     FusionSettings,
@@ -24,7 +23,8 @@ from scenefuse.fuse.modes import (
     fuse_by_distance,
     fuse_by_evidence,
 )
-from scenefuse.fuse.write import Source, frame_ledger, together, with_source
+from scenefuse.fuse.surroundings import REACH, ground_to_add
+from scenefuse.fuse.write import Source, as_bytes, frame_ledger, together, with_source
 from scenefuse.geometry.photo_check import Photos, moved_photos, pack, read_photos
 from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.workspace import read_workspace
@@ -127,7 +127,7 @@ def _region(obj: Cloud, pose: Sim3 | None, crop_json: dict[str, Any]) -> tuple[A
     if pose is None:
         return low, high
     placed = obj.transformed(pose)
-    reach = NEAR * placed.diagonal
+    reach = REACH * placed.diagonal
     return np.minimum(low, placed.points.min(0) - reach), np.maximum(high, placed.points.max(0) + reach)
 
 
@@ -139,7 +139,18 @@ def _by_evidence(
     photos = photos_of(inputs.object_workspace, obj.points, pose), photos_of(inputs.scene_workspace, placed.points)
     stated = value(registration, "covariance") if "covariance" in registration else None
     on_world = None if stated is None else np.array(stated)
-    return fuse_by_evidence(placed, scene, *photos, settings, uncertainty_on_scene(registration), on_world)
+    fused, checked = fuse_by_evidence(placed, scene, *photos, settings, uncertainty_on_scene(registration), on_world)
+    if inputs.object_workspace is None:
+        return fused, checked
+    own, picture = moved_photos(photos[0], checked.settled), read_workspace(inputs.object_workspace).rgb
+    ground = ground_to_add(checked.obj, fused.kept, fused.added, own, picture)
+    if ground.colors is None or not len(ground):
+        return fused, checked
+    if on_world is not None:
+        of_pose = deviations_of_pose(ground, on_world, placed.points.mean(0))
+        ground.fields["world_deviation"] = np.hypot(ground.fields["deviation"], of_pose).astype(np.float32)
+    ground = replace(ground, colors=as_bytes(ground.colors * fused.gain + fused.bias))
+    return replace(fused, added=concatenate([fused.added, ground]), ground=len(ground)), checked
 
 
 def possible(settings: FusionSettings, object_photos: bool, scene_photos: bool) -> tuple[FusionSettings, list[str]]:
@@ -214,6 +225,7 @@ def _report(
         "checked_points": quantity(len(fused.rows), "points"),
         "removed_points": quantity(len(fused.removed), "points"),
         "added_points": quantity(len(added), "points"),
+        "ground_points": quantity(fused.ground, "points"),
         "nerf_only_points": quantity(unconfirmed, "points"),
         "scene_spacing": quantity(scene_spacing, unit),
         "added_spacing": quantity(spacing(added.points) if len(added) > 10 else None, unit),

@@ -64,6 +64,7 @@ class Fused:
         gain: (3,) colour gain of the object.
         bias: (3,) colour bias, 0..255.
         same_distance: distance within which both show the same place.
+        ground: how many of what comes in, the last ones, are not the object's but of the ground beside it.
     """
 
     scene: Cloud
@@ -73,6 +74,7 @@ class Fused:
     gain: Array
     bias: Array
     same_distance: float
+    ground: int = 0
 
     @property
     def removed(self) -> Rows:

@@ -194,7 +194,7 @@ def with_colors_of(obj: Cloud, scene: Cloud, reach: float, wanted: bool) -> tupl
     if close.sum() < MIN_PAIRS:
         return obj, gain, bias
     gain, bias = match_colors(obj.colors[close], scene.colors[partner[close]])
-    return replace(obj, colors=_bytes(obj.colors * gain + bias)), gain, bias
+    return replace(obj, colors=as_bytes(obj.colors * gain + bias)), gain, bias
 
 
 def match_colors(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Array, Array]:
@@ -218,10 +218,11 @@ def feathered(added: Cloud, kept: Cloud, width: float, fill: float) -> Cloud:
     distance, partner = cKDTree(kept.points).query(added.points, k=4, workers=threads())
     share = 0.5 * np.clip(1 - (distance[:, :1] - fill) / width, 0, 1)
     around = kept.colors[partner].astype(np.float64).mean(1)
-    return replace(added, colors=_bytes((1 - share) * added.colors + share * around))
+    return replace(added, colors=as_bytes((1 - share) * added.colors + share * around))
 
 
-def _bytes(colors: Array) -> NDArray[np.uint8]:
+def as_bytes(colors: Array) -> NDArray[np.uint8]:
+    """Colours (N, 3) rounded, within 0..255."""
     return np.clip(np.rint(colors), 0, 255).astype(np.uint8)
 
 

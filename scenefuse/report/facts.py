@@ -57,6 +57,8 @@ def object_facts(row: Row) -> dict[str, str]:
         facts["Surface"] = f"{percent(1 - share)} is there" + (
             f", {percent(share)} is missing: {', '.join(kinds)}" if kinds else ""
         )
+        if has.get("ground_missing"):
+            facts["Surface"] += f"; of the ground at its foot {percent(has['ground_missing'])} is missing"
     if "added_points" in has:
         facts["Points"] = f"{has['added_points']:,.0f} added" + (
             f", {has['removed_points']:,.0f} of the scene removed" if has.get("removed_points") else ""

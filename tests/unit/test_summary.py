@@ -447,7 +447,7 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
     size = {"size": quantity([11.42, 9.96, 8.1], "m"), "deviation": quantity(0.0072, "m")}
     metrics["object"] = size | {"world_deviation": quantity(0.0131, "m")}
     write_json(results / "objects/house/metrics.json", metrics)
-    shares = {"missing": 0.018, "never_seen": 0.01, "untextured": 0.0, "contradicted": 0.008}
+    shares = {"missing": 0.018, "never_seen": 0.01, "untextured": 0.0, "contradicted": 0.008, "ground_missing": 0.012}
     found = {name: quantity(share, "1") for name, share in shares.items()}
     found |= {"stations": quantity(3, ""), "stations_show": quantity(0.77, "1")}
     write_json(results / "objects/house/missing.json", found)
@@ -457,7 +457,8 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
     card = page.split('id="house"')[1].split("<section")[0]
     for sentence in (
         "11.4 m × 9.96 m, 8.10 m high",
-        "98.2 % is there, 1.8 % is missing: 1.0 % seen by no photo, 0.8 % where photos disagree",
+        "98.2 % is there, 1.8 % is missing: 1.0 % seen by no photo, 0.8 % where photos disagree;"
+        " of the ground at its foot 1.2 % is missing",
         "Standard deviation of a point 7.20 mm on the object and 13.1 mm in the scene",
         "Photograph it from 3 places (results/objects/house/next_photos.csv): this would show 77 % of what no photo",
     ):
