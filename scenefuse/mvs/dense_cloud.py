@@ -190,7 +190,7 @@ def _points(own: DepthMap, votes: Votes) -> Cloud:
     """A point for each depth of a map, the mean of those that agree."""
     rows, columns = np.nonzero(own.view.pixels > 0)
     depth, normals, colors = np.split(votes.mean[rows, columns], [1, 4], axis=1)
-    points = back_project(depth[:, 0], own.view.intrinsics, own.view.world_from_cam, rows, columns)
+    points = back_project(depth[:, 0].astype(np.float64), own.view.intrinsics, own.view.world_from_cam, rows, columns)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Cloud(
         points, normals, np.rint(colors).astype(np.uint8), {"views": votes.agree[rows, columns] + np.uint16(1)}
