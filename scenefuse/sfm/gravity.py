@@ -6,8 +6,8 @@ from scenefuse.core.transforms import SD_OVER_MEDIAN, Array
 
 # RMS sine (about 8 degrees) by which the cameras' x axes have to leave one line to fix the vertical on their own.
 MIN_AXIS_SPREAD = 0.15
-# Headings fix the vertical to the scatter of the x axes about it, over their spread and the root of their number. With
-# a larger standard deviation it is no measurement.
+# Headings fix the vertical to the scatter of the x axes about it, over their spread and the root of the number of
+# independent ones. With a larger standard deviation it is no measurement.
 MAX_VERTICAL_SD_DEG = 2.5
 # A hand rolls a camera by so many degrees at least, as far as a few photos show.
 MIN_ROLL_DEG = 1.0
@@ -29,7 +29,7 @@ def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
     One nadir strip and a walk along a wall, both straight, look the same; the walk is assumed.
 
     Args:
-        world_from_cam: (N, 3, 3) camera rotations, OpenCV axes.
+        world_from_cam: (N, 3, 3) camera rotations, OpenCV axes, in the order of the photos.
         centres: (N, 3) camera centres, in any unit.
 
     Returns:
@@ -40,7 +40,7 @@ def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
     if spread >= MIN_AXIS_SPREAD:
         # Image-up sides and looking down both give the sign; for nadir photos only the latter does.
         roll_deg = max(SD_OVER_MEDIAN * roll_spread_deg(world_from_cam, up), MIN_ROLL_DEG)
-        sure = roll_deg / (spread * np.sqrt(len(x))) <= MAX_VERTICAL_SD_DEG
+        sure = roll_deg / (spread * np.sqrt(_independent(x @ up))) <= MAX_VERTICAL_SD_DEG
         return (up if -(y @ up + z @ up).sum() >= 0 else -up), "headings" if sure else "few headings"
     line = np.linalg.eigh(x.T @ x)[1][:, 2]
     candidates = {"image up": -y.mean(0), "viewing direction": -z.mean(0)}
@@ -59,6 +59,14 @@ def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
 def roll_spread_deg(world_from_cam: Array, up: Array) -> float:
     """Median angle in degrees between the cameras' x axes and the horizontal plane: small when `up` explains them."""
     return float(np.degrees(np.median(np.arcsin(np.clip(np.abs(world_from_cam[:, :, 0] @ up), 0.0, 1.0)))))
+
+
+def _independent(rolls: Array) -> float:
+    """How many independent values (N,) are worth, by the correlation of each with the next: a hand that leans to one
+    side for some photos is one error, not many."""
+    away = rolls - rolls.mean()
+    alike = float(away[:-1] @ away[1:] / max(away @ away, 1e-12))
+    return max(len(rolls) * (1 - alike) / (1 + alike), 1.0) if alike > 0 else float(len(rolls))
 
 
 def _orthogonal_to_all(x: Array) -> tuple[Array, float]:

@@ -94,3 +94,13 @@ def test_a_short_walk_that_looks_up_does_not_say_surely_which_way_is_up():
     for seed in range(20):
         up, cue = estimate_up(*front(12.0, 30, seed))
         assert cue == "headings" and np.degrees(np.arccos(up @ UP)) < 3.0
+
+
+def test_photos_that_lean_the_same_way_one_after_the_other_do_not_say_surely_which_way_is_up():
+    def leaning(swings):
+        headings = np.linspace(0, 250, 28)
+        rolls = 9.0 * np.sin(2 * np.pi * swings * np.arange(28) / 28)
+        return np.array([camera(h, -30.0, roll) for h, roll in zip(headings, rolls)]), np.zeros((28, 3))
+
+    assert estimate_up(*leaning(13))[1] == "headings"
+    assert estimate_up(*leaning(2))[1] in UNSURE_CUES
