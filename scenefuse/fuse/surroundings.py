@@ -24,12 +24,14 @@ from scenefuse.geometry.ground import fit_ground
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos
 from scenefuse.photos.workspace import View
 
-# The ground within a tenth of an object's diagonal is its surroundings.
-REACH = 2 * NEAR
+
+def reach_of(obj: Cloud) -> float:
+    """How far from an object the ground is its surroundings: a tenth of its diagonal."""
+    return 2 * NEAR * obj.diagonal
 
 
 def places_on_ground(obj: Cloud, scene: Cloud, step: float, gap: float = 0.0) -> Cloud:
-    """Places on the ground within REACH of an object, `step` apart along x and y; none where the scene has no ground.
+    """Places on the ground within reach of an object, `step` apart along x and y; none where the scene has no ground.
 
     Each lies on the median of the planes of the ground's points nearest to it, seen from above.
 
@@ -39,7 +41,7 @@ def places_on_ground(obj: Cloud, scene: Cloud, step: float, gap: float = 0.0) ->
         step: of the places.
         gap: least distance of a place from known ground, seen from above.
     """
-    low, high, reach = obj.points.min(0), obj.points.max(0), REACH * obj.diagonal
+    low, high, reach = obj.points.min(0), obj.points.max(0), reach_of(obj)
     ground = fit_ground(scene.points, low, high, reach, RESOLUTION * obj.diagonal)
     assert scene.normals is not None
     known = np.abs(scene.normals).argmax(1) == 2
@@ -70,7 +72,7 @@ def ground_to_add(obj: Cloud, scene: Cloud, added: Cloud, photos: Photos, pictur
         photos: the object's, in the scene's frame.
         picture: a view of these with its colours as pixels.
     """
-    low, high, reach = obj.points.min(0), obj.points.max(0), REACH * obj.diagonal
+    low, high, reach = obj.points.min(0), obj.points.max(0), reach_of(obj)
     around = scene[((scene.points >= low - reach) & (scene.points <= high + reach)).all(1)]
     if min(len(around), len(added)) <= NEIGHBOURS:
         return unchecked(added[np.zeros(0, np.int64)])
