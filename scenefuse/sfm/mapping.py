@@ -214,11 +214,11 @@ def _mapped_first(job: Job, calibrated: bool, seed: int) -> tuple[list[pycolmap.
     Pairs that chance verified put photos in wrong places; but some photos have no other pairs. Photos of something else
     have none at all.
     """
-    strong = _models(job, _mapper_options(job, calibrated, seed, STRONG_PAIR))
+    strong = mapped_models(job, _mapper_options(job, calibrated, seed, STRONG_PAIR))
     if strong and not explained_matches(strong[0], job.database).can_grow():
         return strong, STRONG_PAIR
     options = _mapper_options(job, calibrated, seed)
-    every = _models(job, options)
+    every = mapped_models(job, options)
     if every and (not strong or _explained(every[0], job) > _explained(strong[0], job)):
         return every, options.min_num_matches
     return strong, STRONG_PAIR
@@ -251,7 +251,7 @@ def _taken(
     return model, summary | on_earth | {"models_left_out": quantity([], ""), "notes": quantity(notes, "")}
 
 
-def _models(
+def mapped_models(
     job: Job, options: pycolmap.IncrementalPipelineOptions, database: Path | None = None
 ) -> list[pycolmap.Reconstruction]:
     """The models of incremental mapping, that with most photos first."""
@@ -276,7 +276,7 @@ def _with_lens(
         if not found.can_grow() and not doubtful_photos(model, found):
             folders = job.folder, database.parent
             return [cancellable(pycolmap.triangulate_points, model, database, *folders, options=options)], 1
-        again = _models(job, options, database)
+        again = mapped_models(job, options, database)
     if again and _explained(lens.fit(again[0]), job) > found.total:
         return again, 2
     return [model, *ranked[1:]], 1

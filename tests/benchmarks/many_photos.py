@@ -337,7 +337,7 @@ def dense(folder: Path, sparse: Path, report: Path, inputs: list[Any], checkout:
 
 
 def mapped_otherwise(mapper: Mapper) -> Callable[..., list[pycolmap.Reconstruction]]:
-    """What stands in for `mapping._models`: COLMAP's global or hierarchical mapping with the same options."""
+    """What stands in for `mapping.mapped_models`: COLMAP's global or hierarchical mapping with the same options."""
 
     def models(job: mapping.Job, options: Any, database: Path | None = None) -> list[pycolmap.Reconstruction]:
         pycolmap.set_random_seed(options.random_seed)
@@ -378,7 +378,7 @@ def map_otherwise(
     *, mapper: Mapper, folder: Path, photos: Path, database: Path, sparse: Path, report: Path, seed: int
 ) -> None:
     """`map_photos` with another mapper."""
-    mapping._models = mapped_otherwise(mapper)
+    mapping.mapped_models = mapped_otherwise(mapper)
     mapping.map_photos(
         folder=folder, photos=photos, database=database, sparse=sparse, report=report,
         settings=mapping.MappingSettings(), seed=seed,

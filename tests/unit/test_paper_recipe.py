@@ -73,12 +73,13 @@ def test_the_constants_are_the_papers():
     assert preset["object"]["masks"]["method"] == "sam2"
 
 
-def test_the_constants_of_sfm_are_the_papers():
+def test_the_constants_of_sfm_are_the_papers_but_for_the_gain_that_ends_an_adjustment():
     own = read_settings(ROOT / "config/paper.yaml")["scene"]
     assert (own["matches"]["max_ratio"], matches.MAX_DISTANCE, own["matches"]["guided_matching"]) == (0.7, 0.7, True)
     options = colmap.adjustment_options(KNOWN.freedom).ceres.solver_options
     assert (options.max_num_iterations, options.max_linear_solver_iterations) == (100, 200)
-    assert options.function_tolerance == options.gradient_tolerance == options.parameter_tolerance == 0
+    assert (options.gradient_tolerance, options.parameter_tolerance) == (0, 0)
+    assert options.function_tolerance == colmap.ADJUSTMENT_TOLERANCE
 
 
 def test_the_papers_field_and_rays_are_taken_on_a_gpu_and_those_of_the_settings_on_a_cpu():
