@@ -23,7 +23,7 @@ from scenefuse.fuse.modes import (
     fuse_by_distance,
     fuse_by_evidence,
 )
-from scenefuse.fuse.surroundings import REACH, ground_to_add
+from scenefuse.fuse.surroundings import ground_to_add, reach_of
 from scenefuse.fuse.write import Source, as_bytes, frame_ledger, together, with_source
 from scenefuse.geometry.photo_check import Photos, moved_photos, pack, read_photos
 from scenefuse.photos.geodesy import length_unit
@@ -127,7 +127,7 @@ def _region(obj: Cloud, pose: Sim3 | None, crop_json: dict[str, Any]) -> tuple[A
     if pose is None:
         return low, high
     placed = obj.transformed(pose)
-    reach = REACH * placed.diagonal
+    reach = reach_of(placed)
     return np.minimum(low, placed.points.min(0) - reach), np.maximum(high, placed.points.max(0) + reach)
 
 
