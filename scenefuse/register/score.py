@@ -1,5 +1,5 @@
-"""How well a pose explains two surfaces: two-way F-score, colours, free space; hypotheses ranked
-by it; and the registration.* numbers of a pose (method G1)."""
+"""How well a pose explains two surfaces: two-way F-score, colours, free space; hypotheses ranked by it; and the
+registration.* numbers of a pose (method G1)."""
 
 from dataclasses import dataclass
 from typing import Any

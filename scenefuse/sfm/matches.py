@@ -8,6 +8,7 @@ re-matching.
 import contextlib
 import re
 import shutil
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -105,7 +106,8 @@ def match_features(
     with pycolmap.Database.open(features) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         counts = [opened.num_keypoints_for_image(number) for number in names]
-    with resumed_file(database, settings, seed, pairs, names, counts) as temporary:
+        marks = [zlib.crc32(opened.read_keypoints(number).tobytes()) for number in names]
+    with resumed_file(database, settings, seed, pairs, names, marks) as temporary:
         if temporary.is_file():
             print("going on with the pairs that a killed run left", flush=True)
         else:

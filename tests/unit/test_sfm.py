@@ -276,6 +276,8 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
 
 def test_features_and_matches_that_a_signal_ended_are_gone_on_with(capture, tmp_path, monkeypatch):
     folder, _ = capture
+    # With more, which photo is done first decides its number.
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
     photos, sizes = folder / "photos.json", []
 
     def stopped(function, *arguments, **options):
@@ -298,11 +300,10 @@ def test_features_and_matches_that_a_signal_ended_are_gone_on_with(capture, tmp_
             ),
         ):  # fmt: skip
             if name == "again":
-                for module in ("features", "matches"):
-                    monkeypatch.setattr(f"scenefuse.sfm.{module}.cancellable", stopped)
-                with pytest.raises(SystemExit):
+                with monkeypatch.context() as patch, pytest.raises(SystemExit):
+                    for module in ("features", "matches"):
+                        patch.setattr(f"scenefuse.sfm.{module}.cancellable", stopped)
                     stage()
-                monkeypatch.undo()
                 sizes.append([p.stat().st_size for p in tmp_path.glob(".again*part-*.db")])
             stage()
         with pycolmap.Database.open(tmp_path / f"{name}.db") as opened:
@@ -311,6 +312,35 @@ def test_features_and_matches_that_a_signal_ended_are_gone_on_with(capture, tmp_
 
     assert run("once") == run("again")
     assert all(len(kept) == 1 for kept in sizes) and not list(tmp_path.glob(".*"))
+
+
+def test_matches_of_other_features_are_not_gone_on_with(capture, tmp_path, monkeypatch):
+    folder, _ = capture
+    paths = {
+        "photos": folder / "photos.json",
+        "features": tmp_path / "features.db",
+        "database": tmp_path / "matches.db",
+    }
+    extract_features(folder=folder / "upright", photos=paths["photos"], features=paths["features"], settings=FEATURES)
+
+    def run():
+        match_features(**paths, matches=tmp_path / "matches.json", settings=PAIRS, seed=0)
+
+    def stopped(*arguments, **options):
+        raise SystemExit(143)
+
+    monkeypatch.setattr("scenefuse.sfm.matches.cancellable", stopped)
+    with pytest.raises(SystemExit):
+        run()
+    monkeypatch.undo()
+    with pycolmap.Database.open(paths["features"]) as opened:
+        first = opened.read_all_images()[0].image_id
+        moved = opened.read_keypoints(first)
+        moved[:, 0] += 1
+        opened.update_keypoints(first, moved)
+    run()
+    with pycolmap.Database.open(paths["database"]) as opened:
+        np.testing.assert_array_equal(opened.read_keypoints(first), moved)
 
 
 def test_photos_that_look_alike_are_found_by_their_features(tmp_path):
