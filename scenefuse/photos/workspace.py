@@ -67,18 +67,25 @@ class View:
 
     def project(self, points: Array) -> tuple[Array, Array]:
         """Pixels (N, 2) and depths (N,) along z of world points (N, 3); pixels count where the depth is positive."""
-        x_in_cam = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
-        depth = x_in_cam[:, 2]
-        divisor = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
-        return (x_in_cam @ self.intrinsics.T)[:, :2] / divisor[:, None], depth
+        x = self._homogeneous(points)
+        divisor = np.where(np.abs(x[:, 2]) < 1e-9, 1e-9, x[:, 2])
+        return x[:, :2] / divisor[:, None], x[:, 2]
 
     def visible(self, points: Array) -> tuple[Rows, Rows, Array]:
         """Rows (K,) of world points (N, 3) inside the photo, their pixels (K, 2; column, row) and depths (K,)."""
-        at, depth = self.project(points)
-        with np.errstate(invalid="ignore"):
-            inside = (depth > 0) & (at >= 0).all(1) & (at[:, 0] < self.width) & (at[:, 1] < self.height)
-        rows = np.flatnonzero(inside)
-        return rows, np.floor(at[rows]).astype(np.int64), depth[rows]
+        x = self._homogeneous(points)
+        u, v, depth = x.T
+        # Compared before the division, which only what is inside needs.
+        rows = np.flatnonzero((depth > 0) & (u >= 0) & (v >= 0) & (u < self.width * depth) & (v < self.height * depth))
+        x = x[rows]
+        pixels = (x[:, :2] / x[:, 2:]).astype(np.int64)
+        return rows, np.minimum(pixels, (self.width - 1, self.height - 1)), x[:, 2]
+
+    def _homogeneous(self, points: Array) -> Array:
+        """(N, 3) homogeneous pixels of world points, by OpenCV: NumPy's product of so narrow matrices runs on threads
+        that wait for each other, in ten times the time."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        return np.asarray(cv2.transform(points[:, None], self.projection)[:, 0]) if len(points) else points
 
     def resized(self, width: int, height: int) -> View:
         """The same photo at another size, its pixels averaged over areas: never sharper than they were."""
