@@ -96,9 +96,10 @@ def voxel_downsample(cloud: Cloud, voxel: float, mean_colors: bool = False) -> C
     group, counts = voxels(cloud.points, voxel)
     means = _group_means(cloud.points, group, counts)
     distance = ((cloud.points - means[group]) ** 2).sum(1)
-    order = np.lexsort((distance, group))
-    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    chosen = np.sort(order[first])
+    least = np.full(len(counts), np.inf)
+    np.minimum.at(least, group, distance)
+    nearest = np.flatnonzero(distance == least[group])
+    chosen = nearest[np.sort(np.unique(group[nearest], return_index=True)[1])]
     kept = cloud[chosen]
     if mean_colors and cloud.colors is not None:
         colors = np.rint(_group_means(cloud.colors, group, counts)[group[chosen]])

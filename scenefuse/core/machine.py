@@ -50,13 +50,14 @@ def megapixels(folder: Path, width_px: int | None = None) -> float:
 
 
 def use_threads(count: int) -> None:
-    """Let PyTorch, Numba (where they are installed) and OpenCV use `count` threads each."""
+    """Let PyTorch (where the stage has imported it), Numba (where it is installed) and OpenCV use `count` threads each.
+
+    PyTorch takes seconds to import; imported before Numba starts its threads, both use the OpenMP that it brought.
+    """
     import cv2
 
-    torch: Any = None
+    torch: Any = sys.modules.get("torch")
     numba: Any = None
-    with contextlib.suppress(ImportError):
-        import torch  # before Numba starts its threads: it then uses the OpenMP that PyTorch brought along
     with contextlib.suppress(ImportError):
         import numba
 

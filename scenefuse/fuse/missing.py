@@ -106,7 +106,7 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     towards = np.zeros((*grid.shape, 3), np.float32)
     if masks:
         edge, towards = _frontier(grid, surface, views, masks, step, margin)
-        edge &= grid.within(obj.points, MAX_FROM_OBJECT * obj.diagonal)
+        edge = grid.within(obj.points, MAX_FROM_OBJECT * obj.diagonal, edge)
     found = _in_spots(supposed | edge)
     centres, normals = grid.middle(found), towards[found]
     own = supposed[found]
@@ -148,10 +148,12 @@ class _Cells:
         grid[self.place(points)] = True
         return grid
 
-    def within(self, points: Array, distance: float) -> Grid:
-        """The cells no farther than that from one of (N, 3) points."""
-        away = cKDTree(points).query(self.centres, distance_upper_bound=distance, workers=threads())[0]
-        return np.isfinite(away).reshape(self.shape)
+    def within(self, points: Array, distance: float, chosen: Grid) -> Grid:
+        """The chosen cells no farther than that from one of (N, 3) points."""
+        away = cKDTree(points).query(self.middle(chosen), distance_upper_bound=distance, workers=threads())[0]
+        found = self.none()
+        found[chosen] = np.isfinite(away)
+        return found
 
     def middle(self, chosen: Grid) -> Array:
         """(K, 3) centres of the chosen cells."""
@@ -169,7 +171,8 @@ def _frontier(
     # Off the masks nothing of the object is, where photos see the place at all; below the ground few do, through gaps.
     in_sight = seen.in_view - seen.hidden >= np.maximum(MIN_AGREEING, THROUGH_SHARE * seen.in_view)
     empty = (seen.through >= MIN_AGREEING) | (~in_hull & in_sight)
-    bare = ~grid.within(surface.points, SAME_PLACE_SPACINGS * grid.side)
+    beside = ndimage.maximum_filter(grid.hold(surface.points), 2 * int(np.ceil(SAME_PLACE_SPACINGS + 0.5)) + 1)
+    bare = ~grid.within(surface.points, SAME_PLACE_SPACINGS * grid.side, beside)
     free = empty.reshape(grid.shape) & bare
     unknown = (in_hull & ~empty).reshape(grid.shape) & bare
     edge = unknown & ndimage.binary_dilation(free)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
@@ -124,24 +125,28 @@ def shown_in(
     photo that looks along a surface, beyond 75 degrees, does not show it.
     """
     nearest, farthest = _surface_in(surface, view, spacing, both_sides=True)
-    found, towards = depth_test(points, nearest, margin, farthest), view.centre - points
-    front = (normals * towards).sum(1) >= MIN_COSINE * np.linalg.norm(towards, axis=1)
-    return np.asarray(front & (found != Where.OUTSIDE) & (found != Where.BEHIND))
+    found = depth_test(points, nearest, margin, farthest)
+    return _facing(points, normals, view) & (found != Where.OUTSIDE) & (found != Where.BEHIND)
+
+
+def _facing(points: Array, normals: NDArray[np.float32], view: View) -> NDArray[np.bool_]:
+    """(N,) which of (N, 3) points with normals (N, 3) a photo does not look along or see from behind."""
+    towards = view.centre - points
+    ahead, squared = (np.einsum("ni,ni->n", one, towards) for one in (normals, towards))
+    return np.asarray(ahead >= MIN_COSINE * np.sqrt(squared))
 
 
 def _surface_in(surface: Cloud, view: View, spacing: float, both_sides: bool = False) -> tuple[View, Array]:
     """The photo in cells: the least depth of the surface in the 3 x 3 cells around each, and the largest (H, W), where
     most of them hold some; 0 elsewhere."""
     assert surface.normals is not None
-    towards = view.centre - surface.points
-    facing = (surface.normals * towards).sum(1) > MIN_COSINE * np.linalg.norm(towards, axis=1)
-    buffer = depth_buffer(surface.points[both_sides | facing], view, CELL_SPACINGS * spacing)
-    height, width = buffer.pixels.shape
-    padded = np.pad(buffer.pixels, 1)
-    shifted = np.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])
-    known = (shifted > 0).mean(0) > 0.5
-    least = np.where(shifted > 0, shifted, np.inf).min(0)
-    return replace(buffer, pixels=np.where(known, least, 0.0)), np.where(known, shifted.max(0), 0.0)
+    shown = surface.points if both_sides else surface.points[_facing(surface.points, surface.normals, view)]
+    buffer = depth_buffer(shown, view, CELL_SPACINGS * spacing)
+    hit, around = buffer.pixels > 0, np.ones((3, 3))
+    known = cv2.boxFilter(hit.astype(np.float64), -1, around.shape, borderType=cv2.BORDER_CONSTANT) > 0.5
+    least = cv2.erode(np.where(hit, buffer.pixels, np.inf), around)
+    most = cv2.dilate(buffer.pixels, around)
+    return replace(buffer, pixels=np.where(known, least, 0.0)), np.where(known, most, 0.0)
 
 
 @dataclass(frozen=True)

@@ -145,12 +145,14 @@ def write_surface(path: Path, surface: Surface) -> None:
     """Write a binary PLY mesh."""
     records = records_of(surface.vertices, path)
     records.dtype.names = tuple(map(in_file, records.dtype.names or ()))
-    faces = np.empty(len(surface.faces), [("vertex_indices", "i4", (3,)), ("class", "u1")])
-    faces["vertex_indices"], faces["class"] = surface.faces, surface.classes
+    layout = [("vertex_indices", "<i4", (3,)), ("class", "u1")]
+    faces = np.empty(len(surface.faces), [("corners", "u1"), *layout])
+    faces["corners"], faces["vertex_indices"], faces["class"] = 3, surface.faces, surface.classes
+    # plyfile writes lists one by one, in seconds: it only describes them.
+    described = PlyElement.describe(records, "vertex"), PlyElement.describe(np.empty(len(faces), layout), "face")
+    header = PlyData(described, byte_order="<").header
     with atomic_file(path) as temporary:
-        PlyData([PlyElement.describe(records, "vertex"), PlyElement.describe(faces, "face")], byte_order="<").write(
-            str(temporary)
-        )
+        temporary.write_bytes(f"{header}\n".encode() + records.tobytes() + faces.tobytes())
 
 
 def read_surface(path: Path) -> Surface:
@@ -160,10 +162,10 @@ def read_surface(path: Path) -> Surface:
         StageError: it is missing or cut short.
     """
     try:
-        content = PlyData.read(str(path))
+        content = PlyData.read(str(path), known_list_len={"face": {"vertex_indices": 3}})
         table, faces = content["vertex"].data, content["face"].data
         columns = {name.removeprefix(FIELD): np.asarray(table[name]) for name in table.dtype.names}
-        indices = np.asarray(faces["vertex_indices"].tolist(), np.int64).reshape(-1, 3)
+        indices = faces["vertex_indices"].astype(np.int64)
     except Exception as error:
         raise StageError(f"{path} is no surface ({error}); make it again with scenefuse export") from None
     return Surface(cloud_of(columns), indices, np.asarray(faces["class"]), 0.0)
