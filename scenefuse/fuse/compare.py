@@ -28,11 +28,13 @@ class Reason(IntEnum):
 
     KEPT = 0
     SEEN_THROUGH = 1
+    DISPUTED = 2
     REPLACED = 3
 
 
 REASONS = {
     Reason.SEEN_THROUGH: "photos see a surface behind it",
+    Reason.DISPUTED: "close-ups show the place and do not confirm it",
     Reason.REPLACED: "the object measured the place better",
 }
 # How far a point must lie before or behind a surface to be seen through or hidden, as a share of the diagonal.
@@ -65,7 +67,7 @@ class Compared:
     reason: NDArray[np.uint8]
 
 
-def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.0) -> Compared:
+def compare(obj: Measured, scene: Measured, disputed: Mask, views: list[View], share: float = 1.0) -> Compared:
     """Decide which points of both sides stay.
 
     Measured points count as real surface, which hides what is behind it. A measured point of the scene is removed only
@@ -74,6 +76,7 @@ def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.
     Args:
         obj: the object where it settled in the scene.
         scene: the scene's points around it, measured by the photos of both sides.
+        disputed: (M,) of these, points that the object's photos dispute; see `measure_again`.
         views: the photos of both sides.
         share: of the scene's points there that are given.
     """
@@ -92,11 +95,14 @@ def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.
 
     worse, better = better_measured(obj, scene, diagonal, share)
     reason[worse & (reason == Reason.KEPT)] = Reason.REPLACED
+    if len(surface):
+        beside = cKDTree(surface.points).query(scene.cloud.points, workers=threads())[0] <= 2 * RESOLUTION * diagonal
+        reason[disputed & beside & (reason == Reason.KEPT)] = Reason.DISPUTED
     added = obj.surface & ~better
-    replaced = np.flatnonzero(scene.surface & (reason == Reason.REPLACED))
+    removed = np.flatnonzero(scene.surface & (reason >= Reason.DISPUTED))
     stays = concatenate([obj.cloud[added], scene.cloud[reason == Reason.KEPT]])
     reach = SAME_PLACE_SPACINGS * spacing(scene.cloud.points)
-    reason[replaced[_alone(scene.cloud.points[replaced], stays, reach)]] = Reason.KEPT
+    reason[removed[_alone(scene.cloud.points[removed], stays, reach)]] = Reason.KEPT
     return Compared(added, contradicted, reason)
 
 

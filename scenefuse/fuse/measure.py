@@ -13,7 +13,7 @@ from scenefuse.cloud.clouds import Cloud, spacing
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.icp import similarity_rows
-from scenefuse.geometry.photo_check import Matches, Photos, match_in
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Matches, Photos, match_in
 from scenefuse.geometry.surface import normals_at
 
 
@@ -66,16 +66,21 @@ def measure(cloud: Cloud, photos: Photos, diagonal: float) -> Measured:
     return Measured(cloud, matches, supported(cloud.points, matches.measured, diagonal))
 
 
-def measure_again(known: Measured, photos: Photos, diagonal: float) -> Measured:
-    """The same cloud by further photos: each point has the matches of the photos that confirm it more often, and the
-    smaller standard deviation."""
+def measure_again(known: Measured, photos: Photos, diagonal: float) -> tuple[Measured, NDArray[np.bool_]]:
+    """The same cloud by further photos, and (N,) points that these dispute.
+
+    Each point has the matches of the photos that confirm it more often, and the smaller standard deviation. Photos
+    dispute a point where they resolve more than those before, enough of them were compared there and show texture, and
+    they do not confirm it.
+    """
     one, two = known.matches, match_in(known.cloud.points, known.cloud.normals, photos)
     more = two.photos > one.photos
     best = Matches(**{
         name: np.where(more, getattr(two, name), values) for name, values in vars(one).items()
     } | {"match": np.maximum(one.match, two.match), "deviation": np.minimum(one.deviation, two.deviation)})  # fmt: skip
     surface = supported(known.cloud.points, one.measured | two.measured, diagonal)
-    return Measured(known.cloud, best, surface)
+    compared = (two.tested >= CONFIRMING_PHOTOS) & two.textured & (two.step < one.step)
+    return Measured(known.cloud, best, surface), compared & ~two.measured
 
 
 def supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> NDArray[np.bool_]:

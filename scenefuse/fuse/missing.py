@@ -22,7 +22,7 @@ from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, THROUGH_SHARE
 from scenefuse.fuse.measure import NEAR, RESOLUTION
 from scenefuse.geometry.depth_test import see, shown_in
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MIN_AGREEING, Photos, match_in
-from scenefuse.geometry.photo_kernel import GOOD_ANGLE, NOISE
+from scenefuse.geometry.photo_kernel import GOOD_ANGLE
 from scenefuse.geometry.visual_hull import MAX_WRONG_SHARE, Outline, count_silhouettes
 from scenefuse.photos.workspace import View
 
@@ -201,7 +201,7 @@ def _classes(
 ) -> NDArray[np.uint8]:
     """Why each cell is missing, (K,): too few photos of either side see it, it has no texture, or they do not agree."""
     assert cells.normals is not None
-    seen, texture = np.zeros(len(cells), dtype=np.int64), np.zeros(len(cells))
+    seen, textured = np.zeros(len(cells), dtype=np.int64), np.zeros(len(cells), dtype=bool)
     for side in photos:
         shown = np.zeros(len(cells), dtype=np.int64)
         for view in side.views:
@@ -209,8 +209,8 @@ def _classes(
         matches = match_in(cells.points, cells.normals, side)
         # Photos from nearly the same place say nothing of a point's place: they are not tested.
         seen = np.maximum(seen, np.minimum(shown, matches.tested + 1))
-        texture = np.maximum(texture, matches.texture)
-    kinds = np.where(texture < 3 * NOISE, Lack.UNTEXTURED, Lack.CONTRADICTED)
+        textured |= matches.textured
+    kinds = np.where(textured, Lack.CONTRADICTED, Lack.UNTEXTURED)
     return np.where(seen < CONFIRMING_PHOTOS, Lack.NEVER_SEEN, kinds).astype(np.uint8)
 
 

@@ -197,8 +197,9 @@ def check(
         notes.append("the object stays where the registration put it: that is more certain than what the surfaces say")
     mine, obj_photos = mine.moved(settled), moved_photos(obj_photos, settled)
 
-    theirs = measure_again(theirs, obj_photos, diagonal)
-    decided = compare(mine, theirs, obj_photos.views + scene_photos.views, len(chosen) / max(len(scene), 1))
+    theirs, disputed = measure_again(theirs, obj_photos, diagonal)
+    views = obj_photos.views + scene_photos.views
+    decided = compare(mine, theirs, disputed, views, len(chosen) / max(len(scene), 1))
     added, reason = decided.added, decided.reason
     if nerf_only:
         unconfirmed = ~mine.surface & ~decided.contradicted

@@ -36,6 +36,8 @@ PIXEL_ERROR = 0.07
 # The noise of a match is so many times what independent pixels would give: photos share the reference, and samples
 # beside each other their pixels.
 NOISE_FACTOR = 1.8
+# Grey levels (one standard deviation) that a photo's pixels are off at least.
+NOISE = 1.5
 
 
 @dataclass(frozen=True)
@@ -170,6 +172,11 @@ class Matches:
     def measured(self) -> NDArray[np.bool_]:
         """(N,) points that enough photos confirm, where a match says where they are: to MAX_DEVIATION_PX."""
         return (self.photos >= CONFIRMING_PHOTOS) & (self.deviation <= MAX_DEVIATION_PX * self.step)
+
+    @property
+    def textured(self) -> NDArray[np.bool_]:
+        """(N,) points whose window shows more than noise."""
+        return np.asarray(self.texture >= 3 * NOISE)
 
 
 def match_in(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Matches:

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit, prange
 
 from scenefuse.geometry.depth_test import MIN_COSINE
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, OFFSETS
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, NOISE, OFFSETS
 
 # Samples on each side of a patch's middle: 7 x 7 of them, a pixel of the sharpest photo apart.
 RADIUS = 3
@@ -21,8 +21,6 @@ MIN_ANGLE, GOOD_ANGLE, MAX_ANGLE = math.radians(3), math.radians(12), math.radia
 # tried where it and as many as count confirm the point.
 REFERENCES = CONFIRMING_PHOTOS
 REFERENCE_ANGLE = math.radians(20)
-# Grey levels (one standard deviation) that a photo's pixels are off at least.
-NOISE = 1.5
 
 _REFERENCE_COSINE = math.cos(REFERENCE_ANGLE)
 _SIDE = 2 * RADIUS + 1

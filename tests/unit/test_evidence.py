@@ -88,6 +88,20 @@ def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_
     assert not found.added[last].any() and found.contradicted[last].all()
 
 
+def test_what_close_ups_show_and_do_not_confirm_beside_the_object_goes_though_the_flight_confirms_it(near):
+    flight = pack(photographs(8, 9.0, radius=6.0))
+    obj, floating = sheet(-1.0, 0.0, 0.01), sheet(0.01, 0.02, 0.01, z=0.037)
+    floating = floating[np.abs(floating.points[:, 1]) < 0.5]
+    scene = concatenate([sheet(-0.2, 0.4, 0.01), floating])
+    found = check(obj, scene, near, flight, nerf_only=False)
+    last = np.arange(len(scene)) >= len(scene) - len(floating)
+    gone = found.reason == Reason.DISPUTED
+    assert gone[last].mean() > 0.4 and not gone[~last].any()
+    assert (found.scene.fields["evidence"][last & gone] == Evidence.MEASURED).mean() > 0.8
+    # Photos that resolve no more than the scene's own dispute nothing.
+    assert not (check(obj, scene, flight, near, nerf_only=False).reason == Reason.DISPUTED).any()
+
+
 def test_what_the_scene_measured_goes_only_where_something_is_left_beside_it(near, far, monkeypatch):
     obj, scene = sheet(-0.8, 0.4, 0.03), sheet(-0.4, 0.8, 0.06, noise=0.005)
     holed = obj.points[:, 0] > 0.1
