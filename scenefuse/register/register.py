@@ -382,7 +382,7 @@ def summary(found: Registration, searched: str, ups: tuple[Array, Array] | None,
     """The decision in five lines."""
     lines = [f"{'registered' if found.registered else 'unregistered'}: {found.reason}"]
     low, high = found.scales.clamp(0.0), found.scales.clamp(np.inf)
-    held = f"held at {low:.6g}" if found.scales.width == 0 else f"searched from {low:.4g} to {high:.4g}"
+    held = f"held at {low:.6g}" if found.scales.width == 0 else f"started from {low:.4g} to {high:.4g}"
     scale = (
         "" if found.scene_from_object is None else f"{found.scene_from_object.scale:.6g} {found.unit} per object unit, "
     )
