@@ -52,9 +52,10 @@ class Freedom:
     principal_point: bool = False
 
 
-def adjust(model: pycolmap.Reconstruction, freedom: Freedom) -> None:
-    """Adjust poses, points and the free part of the lenses of a model in place, by Cauchy-weighted errors."""
-    cancellable(pycolmap.bundle_adjustment, model, adjustment_options(freedom))
+def adjust(model: pycolmap.Reconstruction, freedom: Freedom, tolerance: float = ADJUSTMENT_TOLERANCE) -> None:
+    """Adjust poses, points and the free part of the lenses of a model in place, by Cauchy-weighted errors, until an
+    iteration gains less than this share of the cost."""
+    cancellable(pycolmap.bundle_adjustment, model, adjustment_options(freedom, tolerance))
 
 
 def adjustment_options(freedom: Freedom, tolerance: float = ADJUSTMENT_TOLERANCE) -> pycolmap.BundleAdjustmentOptions:

@@ -102,7 +102,7 @@ def test_the_spread_covers_a_wrong_lens_and_survives_a_file(tmp_path):
 
 @pytest.mark.parametrize("few", ["three photos", "on one line"])
 def test_photos_of_which_none_can_be_left_out_do_not_say_how_far_their_model_may_be_bent(few, monkeypatch):
-    monkeypatch.setattr(bundle, "adjust", lambda model, freedom: None)
+    monkeypatch.setattr(bundle, "adjust", lambda *_: None)
     model = photographed([700, 700, 500, 400, 0, 0, 0, 0])
     for place, image in enumerate(sorted(model.reg_image_ids())):
         frame = model.frame(model.images[image].frame_id)
