@@ -23,7 +23,7 @@ from scenefuse.sfm.lens import LENSES, MAX_POINTS, Lens
 
 # Groups of photos, each left out once.
 GROUPS = 8
-# Relative gain that ends their adjustments: ten times that of mapping; the spread is the same to a hundredth, in half the time.
+# Relative gain that ends their adjustments. The tenth of it, mapping's, takes twice as long for the same spread to 1 %.
 TOLERANCE = 1e-5
 # Points around a place whose common motion is its motion.
 NEAREST_POINTS = 200
