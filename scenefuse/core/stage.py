@@ -296,13 +296,6 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def manifest(directory: Path) -> dict[str, str]:
-    """Relative path -> SHA-256 of every file below a directory, sorted: what a `directory()` output holds."""
-    directory = Path(directory)
-    files = sorted(p for p in directory.rglob("*") if p.is_file() and p.name != ".snakemake_timestamp")
-    return {p.relative_to(directory).as_posix(): sha256(p) for p in files}
-
-
 def _plain(item: Any) -> Any:
     """NumPy scalars and arrays, and paths, as JSON knows them."""
     if hasattr(item, "tolist"):

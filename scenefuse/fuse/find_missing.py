@@ -1,7 +1,6 @@
 """What an object still lacks after fusion, and the photos that would close most of it."""
 
 import csv
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from scenefuse.cloud.readers.columns import AT_ONCE
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import atomic_file, quantity, read_json, threads, value, write_json
-from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
+from scenefuse.core.transforms import Sim3
 from scenefuse.fuse.fuse_object import photos_of
 from scenefuse.fuse.measure import RESOLUTION, with_normals
 from scenefuse.fuse.missing import NEAR, Lack, Missing, Plan, find_missing_surface, plan_stations, reach_of_stations
@@ -22,7 +21,7 @@ from scenefuse.fuse.modes import around
 from scenefuse.fuse.surroundings import missing_ground
 from scenefuse.fuse.write import added_by, read_changes, together
 from scenefuse.geometry.photo_check import Photos
-from scenefuse.photos.geodesy import GridFrame, LocalFrame, length_unit, scene_frame
+from scenefuse.photos.geodesy import GridFrame, LocalFrame, scene_frame
 from scenefuse.photos.workspace import View, with_mask
 
 POSITION = ("longitude_deg", "latitude_deg", "altitude_m")
@@ -44,8 +43,6 @@ class MissingInputs:
     """PLY of the fusion: what it changed in the scene."""
     fusion_json: Path
     """JSON of the fusion: where the object settled in the scene."""
-    crop_json: Path
-    """JSON of the crop stage, for the direction of gravity."""
     georeference_json: Path
     """JSON with `crs` and the scene's origin, if it has one."""
     object_workspace: Path | None = None
@@ -78,9 +75,8 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
         inputs: see MissingInputs.
         outputs: see MissingOutputs.
     """
-    start = time.perf_counter()
     use_threads(threads())
-    fusion, unit = read_json(inputs.fusion_json), length_unit(inputs.georeference_json)
+    fusion = read_json(inputs.fusion_json)
     if value(fusion, "status") != "fused" or inputs.object_workspace is None:
         nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), None, {"missing": np.zeros(0, np.uint8)})
         write_cloud(outputs.missing, nothing)
@@ -100,21 +96,17 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     cameras = masks or photos[0].views
     near, around_it = _surroundings(inputs, obj, reach_of_stations(obj, cameras) if cameras else 0.0)
     missing = find_missing_surface(obj, near[around(near, obj)], photos, masks)
-    up = np.array(value(read_json(inputs.crop_json), "level_from_scene"))[2]
-    plan = plan_stations(missing, obj, around_it, cameras, up)
+    plan = plan_stations(missing, obj, around_it, cameras)
     write_cloud(outputs.missing, missing.cells)
     georeference = read_json(inputs.georeference_json)
     gps_higher = float(value(georeference, "gps_shift")[2]) if "gps_shift" in georeference else 0.0
-    rows = photo_rows(plan, cameras, up, scene_frame(georeference), gps_higher)
+    rows = photo_rows(plan, cameras, scene_frame(georeference), gps_higher)
     _write_table(outputs.next_photos, rows)
     _write_geojson(outputs.geojson, rows)
-    higher = {row["station"] for row in rows if row["above_close_ups"] > 0}
-    content = _report(missing, plan, unit) | {"stations_above_close_ups": quantity(len(higher), "")}
-    cells, share = missing_ground(obj, near, photos)
-    content |= {"ground_cells": quantity(cells, "cells")}
-    content |= {"ground_missing": quantity(share, "of the ground beside it that photos show")}
-    content |= {"of": quantity("its surface" if masks else "what its own cloud holds", "")}
-    content |= {"seconds": quantity(time.perf_counter() - start, "s")}
+    content = _report(missing, plan) | {
+        "ground_missing": quantity(missing_ground(obj, near, photos), "of the ground beside it that photos show"),
+        "of": quantity("its surface" if masks else "what its own cloud holds", ""),
+    }
     write_json(outputs.report, content)
 
 
@@ -153,16 +145,14 @@ def _silhouette(view: View, path: Path) -> View:
     return replace(small, pixels=small.pixels > 127)
 
 
-def _report(missing: Missing, plan: Plan, unit: str) -> dict[str, Any]:
+def _report(missing: Missing, plan: Plan) -> dict[str, Any]:
     """Shares of the object's surface, and what the stations would close, with units."""
     shares = {kind.name.lower(): missing.share(kind) for kind in Lack}
     return {
         "status": quantity("found", ""),
         "surface_cells": quantity(missing.covered_cells + len(missing.cells), "cells"),
-        "cell_side": quantity(missing.side, unit),
         "missing": quantity(sum(shares.values()), "of the object's surface"),
         **{name: quantity(share, "of the object's surface") for name, share in shares.items()},
-        "seen_through_points": quantity(missing.seen_through, "points"),
         "stations": quantity(len(plan.stations), ""),
         "stations_show": quantity(sum(station.shows for station in plan.stations), "of never seen and contradicted"),
         "reachable": quantity(plan.reachable, "of never seen and contradicted"),
@@ -171,15 +161,13 @@ def _report(missing: Missing, plan: Plan, unit: str) -> dict[str, Any]:
 
 
 def photo_rows(
-    plan: Plan, close_ups: list[View], up: Array, frame: LocalFrame | GridFrame | None, gps_higher: float = 0.0
+    plan: Plan, close_ups: list[View], frame: LocalFrame | GridFrame | None, gps_higher: float = 0.0
 ) -> list[dict[str, Any]]:
-    """A row for each photo; up: (3,) direction opposite to gravity, scene frame; `gps_higher`: metres by which the
-    flight's GPS counts heights higher than the scene."""
-    rows, level = [], rotation_between(up, UP)
-    highest = max((float(view.centre @ up) for view in close_ups), default=0.0)
+    """A row for each photo; `gps_higher`: metres by which the flight's GPS counts heights higher than the scene."""
+    rows, highest = [], max((float(view.centre[2]) for view in close_ups), default=0.0)
     for number, station in enumerate(plan.stations, 1):
         for view in station.photos:
-            ahead = level @ view.cam_from_world[2, :3]
+            ahead = view.cam_from_world[2, :3]
             row = {
                 "station": number,
                 "photo": int(view.name),
@@ -189,7 +177,7 @@ def photo_rows(
                 latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
                 row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
                 row["altitude_m"] = round(altitude + gps_higher, 3)
-            row["above_close_ups"] = float(f"{view.centre @ up - highest:.4g}")
+            row["above_close_ups"] = float(f"{view.centre[2] - highest:.4g}")
             row["heading_deg"] = round(float(np.degrees(np.arctan2(ahead[0], ahead[1]))) % 360, 1)
             row["pitch_deg"] = round(float(np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))), 1)
             rows.append(row | {"shows": round(station.shows, 4)})

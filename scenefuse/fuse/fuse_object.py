@@ -1,19 +1,17 @@
 """Fusion: a registered object comes into the scene, each point with what photos know of it."""
 
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing, write_cloud
+from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.cloud.tiled_cloud import Rows, open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
-from scenefuse.fuse.compare import REASONS, Reason
+from scenefuse.fuse.compare import REASONS
 from scenefuse.fuse.measure import Evidence, deviations_of_pose, unchecked
 from scenefuse.fuse.modes import (
     Checked,
@@ -83,12 +81,11 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
             checked, 1 measured, 2 NeRF or given cloud only, 3 stereo only).
         settings: see FusionSettings.
     """
-    start = time.perf_counter()
     use_threads(threads())
     whole, part, obj = open_cloud(inputs.scene), read_cloud(inputs.crop), read_cloud(inputs.object)
     registration, crop_json = read_json(inputs.fine_json), read_json(inputs.crop_json)
     settings, notes = possible(settings, inputs.object_workspace is not None, inputs.scene_workspace is not None)
-    placed, step = is_placed(registration), spacing(part.points)
+    placed = is_placed(registration)
     pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object"))) if placed else None
     rows, scene = whole.near(*_region(obj, pose, crop_json))
     checked: Checked | None = None
@@ -106,13 +103,12 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
         print(note, flush=True)
     _write(fused, rows, crop_json, outputs)
     unit = length_unit(inputs.georeference_json)
-    write_json(outputs.evidence, evidence_report(fused, checked, unit))
-    content = _report(fused, checked, registration, len(whole), step, unit) | {
+    write_json(outputs.evidence, evidence_report(fused, checked))
+    content = _report(fused, checked, registration, len(whole), unit) | {
         "scene_from_object": quantity(None if pose is None else pose.matrix, unit),
         "mode": quantity(settings.mode, ""),
         "notes": quantity(notes, ""),
         "object_points": quantity(len(obj), "points"),
-        "seconds": quantity(time.perf_counter() - start, "s"),
     }
     write_json(outputs.report, content)
     if outputs.frames is not None:
@@ -207,15 +203,9 @@ def _write(fused: Fused, rows: Rows, crop_json: dict[str, Any], outputs: FusionO
 
 
 def _report(
-    fused: Fused,
-    checked: Checked | None,
-    registration: dict[str, Any],
-    scene_points: int,
-    scene_spacing: float,
-    unit: str,
+    fused: Fused, checked: Checked | None, registration: dict[str, Any], scene_points: int, unit: str
 ) -> dict[str, Any]:
     """What was added and taken away, with units."""
-    added = fused.added
     unconfirmed = None if checked is None else int((checked.obj.fields["evidence"] == Evidence.NERF_ONLY).sum())
     return {
         "status": quantity("fused" if is_placed(registration) else "unregistered", ""),
@@ -224,62 +214,34 @@ def _report(
         "scene_points": quantity(scene_points, "points"),
         "checked_points": quantity(len(fused.rows), "points"),
         "removed_points": quantity(len(fused.removed), "points"),
-        "added_points": quantity(len(added), "points"),
+        "added_points": quantity(len(fused.added), "points"),
         "ground_points": quantity(fused.ground, "points"),
         "nerf_only_points": quantity(unconfirmed, "points"),
-        "scene_spacing": quantity(scene_spacing, unit),
-        "added_spacing": quantity(spacing(added.points) if len(added) > 10 else None, unit),
         "settled_by": quantity(None if checked is None else checked.moved, "diagonals"),
         "fill_distance": quantity(fused.same_distance, unit),
         "color_gain": quantity(fused.gain, "1"),
-        "color_bias": quantity(fused.bias, "of 255"),
     }
 
 
-def evidence_report(fused: Fused, checked: Checked | None, unit: str) -> dict[str, Any]:
+def evidence_report(fused: Fused, checked: Checked | None) -> dict[str, Any]:
     """What photos say of both sides' points; without `evidence`, only what was taken away.
 
-    `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added or better in the scene. Of
-    the others, photos see through `object_contradicted`; fewer than three could be compared at `object_unasked`.
-    `added_photos` is how many photos confirm the measured points that were added.
+    Photos see through the `object_contradicted` points; about the others that are not measured they say nothing.
     """
     removed = {text: int((fused.reason == code).sum()) for code, text in REASONS.items()}
     content = {"scene_removed": quantity(removed, "points")}
     if checked is None:
         return content | {"notes": quantity(["no photo was compared"], "")}
-    fields, of_scene = checked.obj.fields, checked.scene.fields["evidence"] == Evidence.MEASURED
-    measured, left = fields["evidence"] == Evidence.MEASURED, checked.reason == Reason.KEPT
-    middle = float(np.median(fields["deviation"][measured])) if measured.any() else None
-    masks = {
-        "object_measured": measured,
-        "object_nerf_only": fields["evidence"] == Evidence.NERF_ONLY,
-        "object_contradicted": checked.contradicted,
-        "object_better_in_scene": measured & ~checked.added,
-        "object_added": checked.added,
-        "object_unasked": ~measured & np.isnan(fields["match"]),
-        "scene_measured": of_scene,
-        "scene_stereo_only": ~of_scene,
-        "scene_kept": left,
-        "scene_kept_measured": left & of_scene,
-    }
+    of_object, of_scene = (c.fields["evidence"] == Evidence.MEASURED for c in (checked.obj, checked.scene))
     return content | {
-        "object_points": quantity(len(measured), "points"),
-        "scene_checked": quantity(len(left), "points"),
-        **{name: quantity(int(mask.sum()), "points") for name, mask in masks.items()},
-        "deviation_median": quantity(middle, unit),
-        "object_measured_share": quantity(float(measured.mean()) if len(measured) else None, "1"),
-        "added_photos": quantity(_quantiles(fields["photos"][checked.added & measured]), "photos"),
-        "settled_by": quantity(checked.moved, "diagonals"),
+        "scene_checked": quantity(len(of_scene), "points"),
+        "scene_measured": quantity(int(of_scene.sum()), "points"),
+        "object_points": quantity(len(of_object), "points"),
+        "object_measured": quantity(int(of_object.sum()), "points"),
+        "object_measured_share": quantity(float(of_object.mean()) if len(of_object) else None, "1"),
+        "object_contradicted": quantity(int(checked.contradicted.sum()), "points"),
         "notes": quantity(checked.notes, ""),
     }
-
-
-def _quantiles(values: NDArray[Any]) -> dict[str, float] | None:
-    """Least, median and largest of (N,) values, and the twentieth from below."""
-    if not len(values):
-        return None
-    places = {"least": 0.0, "5 %": 0.05, "median": 0.5, "largest": 1.0}
-    return {name: float(np.quantile(values, place, method="lower")) for name, place in places.items()}
 
 
 def _in_box(cloud: Cloud, crop_json: dict[str, Any]) -> Cloud:

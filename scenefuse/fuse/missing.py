@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
 from scenefuse.core.stage import threads
-from scenefuse.core.transforms import UP, Array, look_at, rotation_between
+from scenefuse.core.transforms import UP, Array, look_at
 from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, THROUGH_SHARE
 from scenefuse.fuse.measure import NEAR, RESOLUTION
 from scenefuse.geometry.depth_test import see, shown_in
@@ -62,14 +62,12 @@ class Missing:
         cells: centres of its cells, with normals towards empty space and the field `missing`, a value of `Lack`.
         side: of a cell, unit of the frame.
         covered_cells: cells of the object's surface that the completed scene has.
-        seen_through: points of the object that photos see through: nothing is there, so nothing is missing.
         notes: what a user should know.
     """
 
     cells: Cloud
     side: float
     covered_cells: int
-    seen_through: int
     notes: tuple[str, ...]
 
     def share(self, kind: int) -> float:
@@ -117,7 +115,7 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     cells.fields["missing"] = _classes(cells, surface, photos, step, margin)
     few = f"{len(masks)} masks: what they do not frame is unknown, only points of the object's own cloud are looked at"
     notes = (few,) if len(masks) < CONFIRMING_PHOTOS else ()
-    return Missing(cells, side, int(grid.hold(obj.points[~apart]).sum()), int(through.sum()), notes)
+    return Missing(cells, side, int(grid.hold(obj.points[~apart]).sum()), notes)
 
 
 class _Cells:
@@ -245,7 +243,7 @@ class Plan:
     reachable: float
 
 
-def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[View], up: Array) -> Plan:
+def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[View]) -> Plan:
     """The stations that show most of the missing surface.
 
     Untextured surface is left out, since photos from elsewhere do not measure it either; so is contradicted surface for
@@ -256,7 +254,6 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
         obj: the object in it.
         around: everything that stands in the way, with normals: the completed scene.
         close_ups: the object's cameras in the scene's frame, for lens and distance.
-        up: (3,) unit vector opposite to gravity.
     """
     cells = missing.cells[missing.cells.fields["missing"] != Lack.UNTEXTURED]
     if len(cells) == 0 or not close_ups:
@@ -275,8 +272,8 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
     )
     step = max(missing.side, spacing(obstacles.points, quantile=SPARSEST))
     lens = sorted(close_ups, key=lambda view: view.intrinsics[0, 0] / view.width)[len(close_ups) // 2]
-    photos = [_photos_from(place, middle, lens, up) for place in _around(middle, distance, up)]
-    free = _Free(others.points, middle, reach, clearance, up)
+    photos = [_photos_from(place, middle, lens) for place in _around(middle, distance)]
+    free = _Free(others.points, middle, reach, clearance)
     photos = [three for three in photos if free.ways(np.array([photo.centre for photo in three]))]
     # What the middle photo shows is the most that all three do; these are tested only where it decides (Minoux 1978).
     shown = np.array([_shown_in_all(three[1:2], cells, obstacles, step, missing.side) for three in photos])
@@ -308,29 +305,25 @@ def reach_of_stations(obj: Cloud, close_ups: list[View]) -> float:
     return 2 * max(DISTANCES) * _close_ups_from(obj, close_ups)[1]
 
 
-def _around(middle: Array, distance: float, up: Array) -> Array:
+def _around(middle: Array, distance: float) -> Array:
     """(P, 3) places around an object, nearest first."""
     number = np.arange(DIRECTIONS) + 0.5
     height, turn = 1 - 2 * number / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * number
     flat = np.sqrt(1 - height**2)
     directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
-    directions = directions @ rotation_between(UP, up).T
     return np.concatenate([middle + factor * distance * directions for factor in sorted(DISTANCES)])
 
 
 class _Free:
     """Where a camera can be: above the ground, and with nothing between it and the object."""
 
-    def __init__(self, obstacles: Array, middle: Array, reach: float, clearance: float, up: Array):
+    def __init__(self, obstacles: Array, middle: Array, reach: float, clearance: float):
         self.middle, self.reach, self.clearance = middle, reach, clearance
-        self.level_from_scene = rotation_between(up, UP)
-        self.level = obstacles @ self.level_from_scene.T
-        self.near, self.below = cKDTree(obstacles), cKDTree(self.level[:, :2])
+        self.obstacles, self.near, self.below = obstacles, cKDTree(obstacles), cKDTree(obstacles[:, :2])
 
     def ways(self, eyes: Array) -> bool:
         """Whether all of (E, 3) places see the object over free space, up to what stands beside it."""
-        at = eyes @ self.level_from_scene.T
-        if (at[:, 2] < self.level[self.below.query(at[:, :2])[1], 2] + self.clearance).any():
+        if (eyes[:, 2] < self.obstacles[self.below.query(eyes[:, :2])[1], 2] + self.clearance).any():
             return False
         ahead = self.middle - eyes
         ends = np.maximum(0, 1 - self.reach / np.linalg.norm(ahead, axis=1))
@@ -338,16 +331,16 @@ class _Free:
         return bool((self.near.query((eyes + steps * ahead).reshape(-1, 3))[0] > self.clearance).all())
 
 
-def _photos_from(place: Array, middle: Array, lens: View, up: Array) -> list[View]:
+def _photos_from(place: Array, middle: Array, lens: View) -> list[View]:
     """Three cameras beside each other, the second at the place, that look at the middle."""
     away = place - middle
-    axis = up - (up @ away) / (away @ away) * away
+    axis = UP - (UP @ away) / (away @ away) * away
     axis /= np.linalg.norm(axis)
     photos = []
     for number, angle in enumerate(GOOD_ANGLE * np.array([-1, 0, 1]), 1):
         eye = middle + np.cos(angle) * away + np.sin(angle) * np.cross(axis, away)
         pose = np.eye(4)
-        pose[:3, :3] = look_at(eye, middle, up)
+        pose[:3, :3] = look_at(eye, middle, UP)
         pose[:3, 3] = -pose[:3, :3] @ eye
         photos.append(View(str(number), lens.intrinsics, pose, lens.width, lens.height))
     return photos

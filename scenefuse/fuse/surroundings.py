@@ -90,8 +90,8 @@ def ground_to_add(obj: Cloud, scene: Cloud, added: Cloud, photos: Photos, pictur
     return replace(ground, colors=colors)
 
 
-def missing_ground(obj: Cloud, completed: Cloud, photos: tuple[Photos, Photos]) -> tuple[int, float | None]:
-    """How many cells of the ground beside an object photos of one side show, and the share beside which no point lies.
+def missing_ground(obj: Cloud, completed: Cloud, photos: tuple[Photos, Photos]) -> float | None:
+    """Of the ground beside an object that photos of one side show, the share where no point lies; None without any.
 
     Args:
         obj: the object in the scene's frame, z up.
@@ -103,9 +103,9 @@ def missing_ground(obj: Cloud, completed: Cloud, photos: tuple[Photos, Photos]) 
     counts = [_shown_in_each(places, completed, one.views, side).sum(0) for one in photos]
     shown = places[np.maximum(*counts) >= CONFIRMING_PHOTOS]
     if not len(shown):
-        return 0, None
+        return None
     apart = cKDTree(completed.points).query(shown.points, workers=threads())[0]
-    return len(shown), float((apart > SAME_PLACE_SPACINGS * side).mean())
+    return float((apart > SAME_PLACE_SPACINGS * side).mean())
 
 
 def _shown_in_each(places: Cloud, surface: Cloud, views: list[View], side: float) -> NDArray[np.bool_]:

@@ -5,7 +5,6 @@ A scene is never copied for an object: its changes name the rows of the scene's 
 that is read.
 """
 
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -311,7 +310,6 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_copc:
     Raises:
         StageError: no point is left.
     """
-    start = time.perf_counter()
     scene = open_cloud(inputs.scene)
     changes, added = list[Changes](), list[Cloud]()
     failed = {
@@ -341,7 +339,6 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_copc:
     content = _report(counts, len(scene), [folder.name for folder in inputs.objects], unregistered, failed) | {
         "crs": quantity(None if frame is None else frame.crs, ""),
         "version": quantity(VERSION, ""),
-        "seconds": quantity(time.perf_counter() - start, "s"),
     }
     write_json(report, content)
 

@@ -16,7 +16,6 @@ from scenefuse.core.stage import (
     StageError,
     atomic_directory,
     atomic_file,
-    manifest,
     quantity,
     read_json,
     threads,
@@ -107,12 +106,11 @@ def make_masks(
     with atomic_directory(masks) as folder:
         for name in kept:
             write_picture(folder / f"{Path(name).stem}.png", made.masks[name].astype(np.uint8) * 255)
-        files = manifest(folder)
     with atomic_file(contact_sheet) as path:
         write_picture(path, _contact_sheet(photos.views, made))
     content = _report(made, found, len(photos.views), kept, settings) | by
     print(f"{len(kept)} of {len(photos.views)} masks, median agreement {value(content, 'median_agreement'):.3f}")
-    write_json(report, content | {"files": files})
+    write_json(report, content)
 
 
 def _make(
@@ -242,7 +240,7 @@ def _contact_sheet(views: list[View], made: ScoredMasks) -> NDArray[np.uint8]:
 
 
 def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str], settings: MaskSettings) -> dict[str, Any]:
-    """What the stage found, without its files."""
+    """What the stage found."""
     per_photo = {
         name: {"area": round(float(mask.mean()), 5), "agreement": round(float(made.scores[name]), 4)}
         | ({"quality": round(found.quality[name], 4)} if name in found.quality else {})
@@ -257,7 +255,6 @@ def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str], se
         "ground": quantity("measured" if found.target.ground_found else "not found; bottom of the box", ""),
         "clicks_left_out": quantity(found.left_out, ""),
         "notes": quantity(list(found.notes), ""),
-        "hull_voxel": quantity(made.hull.voxel, "object units"),
         "dropped": made.dropped,
         "per_photo": per_photo,
     }

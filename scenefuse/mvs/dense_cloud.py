@@ -65,8 +65,8 @@ def fuse_depth_maps(
         settings: see DenseCloudSettings.
         cloud: output PLY in the workspace's frame: float64 positions, normals, colours, `views` (photos
             that agree on the point).
-        report: output JSON: number of points, spacing, backend, what was dropped, the share of the pixels with a depth
-            that are in the cloud, and a note where it is small, and the share that other maps voted out.
+        report: output JSON: number of points, spacing, backend, the share of the pixels with a depth that are in
+            the cloud, a note where it is small, and the share that other maps voted out.
 
     Raises:
         StageError: no depth maps, or no point on which enough photos agree.
@@ -90,7 +90,7 @@ def fuse_depth_maps(
     near = near_others(fused.points)
     kept = voxel_downsample(fused[near], pixel)
     print(f"{len(kept)} points, {(~near).sum()} of {len(fused)} dropped as outliers before thinning", flush=True)
-    content = _report(kept, int((~near).sum()), measured, stages, length_unit(georeference_json))
+    content = _report(kept, measured, stages, length_unit(georeference_json))
     write_tiled(cloud, lambda: [kept], len(kept), kept.points)
     content |= {"depth_maps": quantity(len(maps), "1"), "outvoted_share": quantity(1 - left / max(measured, 1), "1")}
     write_json(report, content)
@@ -101,7 +101,7 @@ def _all(stages: list[dict[str, Any]], name: str) -> str:
     return ", ".join(sorted({value(stage, name) for stage in stages}))
 
 
-def _report(cloud: Cloud, dropped: int, measured: int, stages: list[dict[str, Any]], unit: str) -> dict[str, Any]:
+def _report(cloud: Cloud, measured: int, stages: list[dict[str, Any]], unit: str) -> dict[str, Any]:
     """The cloud in numbers, with a note where it holds few of the measured pixels; and how its depth maps were made."""
     share, notes = float(cloud.fields["views"].sum() / max(measured, 1)), []
     if share < MIN_FUSED_SHARE:
@@ -112,9 +112,7 @@ def _report(cloud: Cloud, dropped: int, measured: int, stages: list[dict[str, An
         print(f"note: {notes[0]}", flush=True)
     return {
         "points": quantity(len(cloud), "1"),
-        "dropped_outliers": quantity(dropped, "1"),
         "spacing": quantity(spacing(cloud.points), unit),
-        "median_views": quantity(float(np.median(cloud.fields["views"])), "1"),
         "fused_share": quantity(share, "1"),
         "notes": quantity(notes, ""),
         "backend": quantity(_all(stages, "backend"), ""),

@@ -16,7 +16,6 @@ from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import (
     StageError,
     atomic_directory,
-    manifest,
     quantity,
     scratch_directory,
     threads,
@@ -74,9 +73,8 @@ def estimate_depth_maps(
             _run_plane_sweep(photos, references, settings, device, folder)
         names = [reference.view.name for reference in references]
         coverage = [float((read_depth(folder / "depth_maps" / f"{name}.bin") > 0).mean()) for name in names]
-        files = manifest(folder)
     how = {"backend": backend, "reason": reason, "device": device, "chunk": f"{chunk} of {chunks}"}
-    write_json(report, _report(how, references, coverage) | {"files": files})
+    write_json(report, _report(how, references, coverage))
 
 
 def _choose_backend(backend: str) -> tuple[str, str]:
@@ -94,7 +92,7 @@ def _choose_backend(backend: str) -> tuple[str, str]:
 
 
 def _report(how: dict[str, str], references: list[Reference], coverage: list[float]) -> dict[str, Any]:
-    """How depths were made, and what came out for each photo; without the files."""
+    """How depths were made, and what came out for each photo."""
     photos = {
         reference.view.name: {
             "sources": [view.name for view in reference.sources],
@@ -104,9 +102,7 @@ def _report(how: dict[str, str], references: list[Reference], coverage: list[flo
         }
         for reference, share in zip(references, coverage)
     }
-    median = float(np.median(coverage)) if coverage else 0.0
-    texts = {key: quantity(text, "") for key, text in how.items()}
-    return texts | {"median_coverage": quantity(median, "1"), "photos": photos}
+    return {key: quantity(text, "") for key, text in how.items()} | {"photos": photos}
 
 
 def _run_plane_sweep(

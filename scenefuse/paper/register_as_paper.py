@@ -15,7 +15,6 @@ have a mutual one), ICP on clouds thinned to half a voxel, and a single thread, 
 """
 
 import ctypes
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -87,7 +86,6 @@ def register_as_paper(
     Raises:
         StageError: a cloud's points lie in one place or along one line.
     """
-    start = time.perf_counter()
     obj, scene = inputs.clouds()
     ups = inputs.ups()
     ledger = estimates(obj, scene, ups)
@@ -102,14 +100,12 @@ def register_as_paper(
     problem = Problem(obj, scene, ScaleRange(held, 0.0), Constraints(ups), seed)
     pose, notes = paper_coarse(problem)
     coarse = _rated(problem, pose, SCORE_FRACTION / 2, SURFACE_POINTS // 2)
-    between = time.perf_counter()
     fine = _rated(problem, paper_fine(obj, scene, pose), FineSettings().voxel_fraction, SURFACE_POINTS)
-    end = time.perf_counter()
     if picture is not None:
         draw_alignment(picture, obj, scene, fine.pose, seed)
     write_json(scale_report, scale_quantities(ledger, problem.scales, scale))
-    write_json(coarse_report, coarse_quantities([coarse], False, [*said, *notes], between - start))
-    write_json(report, _report(fine, problem, inputs.length_unit(), end - between))
+    write_json(coarse_report, coarse_quantities([coarse], False, [*said, *notes]))
+    write_json(report, _report(fine, problem, inputs.length_unit()))
 
 
 def _rated(problem: Problem, pose: Sim3, fraction: float, most: int) -> Hypothesis:
@@ -118,7 +114,7 @@ def _rated(problem: Problem, pose: Sim3, fraction: float, most: int) -> Hypothes
     return Hypothesis(pose, "fpfh", score(*problem.surfaces(scale, fraction, most), pose, tau, scale))
 
 
-def _report(best: Hypothesis, problem: Problem, length: str, seconds: float) -> dict[str, Any]:
+def _report(best: Hypothesis, problem: Problem, length: str) -> dict[str, Any]:
     """The stage JSON, with the keys of the fine registration's."""
     reason = "the paper's recipe has no gate"
     print(f"ungated: {reason}", flush=True)
@@ -132,7 +128,6 @@ def _report(best: Hypothesis, problem: Problem, length: str, seconds: float) -> 
         "tilt_deg": quantity(tilt_deg(best.pose, problem.known.ups), "deg"),
         **uncertainty_quantities(None, length),
         "hypotheses": quantity([best.as_json()], ""),
-        "seconds": quantity(seconds, "s"),
     }
 
 

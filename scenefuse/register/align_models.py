@@ -5,7 +5,6 @@ gives one more estimate, which no feature enters.
 """
 
 import contextlib
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -136,19 +135,18 @@ def align_models(
     Raises:
         StageError: a database does not belong to its model.
     """
-    begin = time.perf_counter()
     obj = read_landmarks(object_sparse, object_features)
     scene = read_landmarks(scene_sparse, scene_features)
     gps = pose_by_gps(obj, scene, object_photos, scene_photos, scene_json, settings.gps_accuracy_m, seed)
     content = align_landmarks(obj, scene, settings, seed, gps)
     print(f"{'found' if content['found']['value'] else 'not found'}: {content['reason']['value']}", flush=True)
-    write_json(report, {**content, "seconds": quantity(time.perf_counter() - begin, "s")})
+    write_json(report, content)
 
 
 def align_landmarks(
     obj: Landmarks, scene: Landmarks, settings: AlignmentSettings, seed: int, gps: GpsPose | None = None
 ) -> dict[str, Any]:
-    """Match, find a consensus, refine, apply the gate: the stage JSON without its time."""
+    """Match, find a consensus, refine, apply the gate: the stage JSON."""
     pairs = match_landmarks(obj, scene, settings.max_ratio)
     print(f"{len(obj.points)} points of the object, {len(scene.points)} of the scene, {len(pairs)} matches", flush=True)
     seen = observations(obj, scene, pairs)

@@ -1,7 +1,6 @@
 """Coarse registration: the scale's prior, candidates from features and from gravity, briefly refined, the distinct best
 kept."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,7 +72,6 @@ def register_coarsely(
     Raises:
         StageError: a cloud's points lie in one place or along one line.
     """
-    start = time.perf_counter()
     (obj, scene), ups = inputs.clouds(), inputs.ups()
     ledger = estimates(obj, scene, ups)
     problem = Problem(obj, scene, prior(ledger, scale), Constraints(ups), seed)
@@ -83,12 +81,10 @@ def register_coarsely(
         notes.append("no feature or heading gave a pose; the clouds' centres were laid on each other instead")
         print(notes[-1], flush=True)
         found = [_centred(problem)]
-    write_json(report, coarse_quantities(found, problem.known.ups is not None, notes, time.perf_counter() - start))
+    write_json(report, coarse_quantities(found, problem.known.ups is not None, notes))
 
 
-def coarse_quantities(
-    found: Sequence[Hypothesis], gravity_used: bool, notes: list[str], seconds: float
-) -> dict[str, Any]:
+def coarse_quantities(found: Sequence[Hypothesis], gravity_used: bool, notes: list[str]) -> dict[str, Any]:
     """The stage JSON of hypotheses, best first; each is printed."""
     for h in found:
         print(f"{h.source:8s} scale {h.pose.scale:.4g} score {h.score.total:.3f} F {h.score.f_score:.3f}", flush=True)
@@ -99,7 +95,6 @@ def coarse_quantities(
         "gravity_used": quantity(gravity_used, ""),
         "hypotheses": quantity([h.as_json() for h in found], ""),
         "notes": quantity(notes, ""),
-        "seconds": quantity(seconds, "s"),
     }
 
 

@@ -1,6 +1,5 @@
 """Fine registration: the stage around `refine_hypotheses`, its report and its picture (method R10, R11)."""
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,7 +84,6 @@ def register_finely(
     Raises:
         StageError: a cloud's points lie in one place or along one line.
     """
-    start = time.perf_counter()
     obj, scene = inputs.clouds()
     prior = read_json(scale_json)
     alignment = read_alignment(known.alignment_json) if settings.use_alignment else None
@@ -95,10 +93,9 @@ def register_finely(
     outcome = refine_hypotheses(problem, read_candidates(coarse_json), settings)
     bending = known.bending(outcome.ranked[0].pose, obj.points.mean(0))
     outcome = outcome.unless_bent(bending[0], scene.diagonal)
-    seconds = time.perf_counter() - start
     if picture is not None:
         draw_alignment(picture, obj, scene, outcome.ranked[0].pose, seed)
-    write_json(report, _report(outcome, problem, seconds) | _stated(outcome, bending, inputs.length_unit()))
+    write_json(report, _report(outcome, problem) | _stated(outcome, bending, inputs.length_unit()))
 
 
 def read_candidates(coarse_json: Path) -> list[Candidate]:
@@ -107,7 +104,7 @@ def read_candidates(coarse_json: Path) -> list[Candidate]:
     return [(Sim3.from_matrix(np.array(h["scene_from_object"])), h["source"]) for h in found]
 
 
-def _report(outcome: Outcome, problem: Problem, seconds: float) -> dict[str, Any]:
+def _report(outcome: Outcome, problem: Problem) -> dict[str, Any]:
     """The stage JSON; the decision is printed."""
     best, decision = outcome.ranked[0], outcome.decision
     status = "registered" if decision.registered else "unregistered"
@@ -123,7 +120,6 @@ def _report(outcome: Outcome, problem: Problem, seconds: float) -> dict[str, Any
         "tilt_deg": quantity(tilt_deg(best.pose, problem.known.ups), "deg"),
         "rival": quantity(None if decision.rival is None else decision.rival.as_json(), ""),
         "hypotheses": quantity([h.as_json() for h in outcome.ranked], ""),
-        "seconds": quantity(seconds, "s"),
     }
 
 

@@ -195,7 +195,6 @@ def import_photos(
     source = "the photos' alpha channel" if exact else str(masks or "the masks that the data name")
     origin = {
         "format": quantity(kind, ""),
-        "masks_from": quantity(source, ""),
         "masks_exact": quantity(exact, ""),
         "held_out_by_the_data": quantity(held_out, ""),
         "notes": quantity(notes, ""),

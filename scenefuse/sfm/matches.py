@@ -139,11 +139,7 @@ def match_features(
         "pairs_choice": quantity(choice, ""),
         "pairs_reason": quantity(reason, ""),
         "pairs": quantity(len(pairs), "1"),
-        "verified_pairs": quantity(verified, "1"),
         "inlier_matches": quantity(inliers, "1"),
-        "guided_matching": quantity(settings.guided_matching, ""),
-        "max_ratio": quantity(settings.max_ratio, "1"),
-        "max_distance": quantity(MAX_DISTANCE, "1"),
     }
     write_json(matches, content)
 

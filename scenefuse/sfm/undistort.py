@@ -10,13 +10,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from scenefuse.core.stage import atomic_directory, manifest, quantity, read_json, setting, threads, value, write_json
+from scenefuse.core.stage import atomic_directory, quantity, read_json, setting, threads, value, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.photos.photos import check_unchanged, read_photos
 from scenefuse.photos.pictures import JPEG_QUALITY
 from scenefuse.photos.workspace import View, read_model, read_workspace
 from scenefuse.sfm.colmap import cancellable
-from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
+from scenefuse.sfm.gravity import estimate_up
 
 # A picture with more than this many times the pixels (along one side) is averaged before it is sampled. Undistorting
 # alone scales by a few percent, which bilinear sampling does better without.
@@ -107,26 +107,16 @@ def _report(folder: Path, known_cue: str | None) -> dict[str, Any]:
     up, cue = estimate_up(poses[:, :3, :3], poses[:, :3, 3])
     if known_cue is not None:
         up, cue = np.array([0.0, 0.0, 1.0]), known_cue
-    roll_deg = roll_spread_deg(poses[:, :3, :3], up)
-    print(
-        f"{len(workspace.views)} undistorted photos; up: {np.round(up, 3)} from {cue}, median roll {roll_deg:.2f} deg",
-        flush=True,
-    )
-    cameras = sorted(
-        {(v.width, v.height, round(float(np.mean(np.diag(v.intrinsics)[:2])), 3)) for v in workspace.views}
-    )
+    print(f"{len(workspace.views)} undistorted photos; up: {np.round(up, 3)} from {cue}", flush=True)
     gap_deg, between = largest_gap(poses, up)
     return {
         "largest_gap_deg": quantity(gap_deg, "deg"),
         "gap_between": quantity([workspace.views[index].name for index in between], ""),
         "up_in_camera_frame": quantity(up, "1"),
         "up_cue": quantity(cue, ""),
-        "camera_roll_median_deg": quantity(roll_deg, "deg"),
         "photos": quantity(len(workspace.views), "1"),
         "points": quantity(len(workspace.points), "1"),
-        "sizes_px": quantity(sorted({camera[:2] for camera in cameras}), "px"),
-        "focal_px": quantity([camera[2] for camera in cameras], "px"),
-        "files": quantity(manifest(folder), ""),
+        "sizes_px": quantity(sorted({(view.width, view.height) for view in workspace.views}), "px"),
     }
 
 

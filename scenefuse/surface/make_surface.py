@@ -1,6 +1,5 @@
 """The stage that makes the surface of one completed object."""
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,7 +48,6 @@ def make_surface(*, inputs: SurfaceInputs, surface: Path, glb: Path, report: Pat
         glb: output GLB in metres, y up; the scene's place in the world is in `asset.extras`.
         report: output JSON: areas and their shares.
     """
-    start = time.perf_counter()
     use_threads(threads())
     views = placed_views(inputs)
     try:
@@ -68,7 +66,6 @@ def make_surface(*, inputs: SurfaceInputs, surface: Path, glb: Path, report: Pat
         "reason": quantity(reason, ""),
         "texture": quantity(why, ""),
         "textured": quantity(0.0 if painted is None else painted.shown_share, "of the area that is not bridged"),
-        "seconds": quantity(time.perf_counter() - start, "s"),
     }
     write_json(report, content)
 

@@ -1,7 +1,6 @@
 """The scene with a registered object in it, where neither has photos: what the scene lacks comes in, by distance."""
 
 import copy
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +44,6 @@ class Completed:
         fill_distance: distance within which both show the same place.
         mode: `fill`, or the mode for comparison that the settings name.
         notes: what a user should know.
-        seconds: that it took.
     """
 
     before: Cloud
@@ -57,7 +55,6 @@ class Completed:
     fill_distance: float
     mode: str
     notes: list[str]
-    seconds: float
 
 
 def fusion_settings(config: Path | None) -> FusionSettings:
@@ -77,7 +74,6 @@ def complete(
         settings: of the fusion; `evidence` needs photos and becomes `fill`, which a note says.
         around: how far around the object the scene is read at least.
     """
-    start = time.perf_counter()
     settings, notes = possible(settings, False, False)
     moved = obj.transformed(scene_from_object)
     reach = max(NEAR * moved.diagonal, around)
@@ -95,8 +91,7 @@ def complete(
     changes, added = fused.changes(rows), with_source(fused.added, source)
     after = together(changes.left_of(rows, near), added)
     return Completed(
-        near, after, rows[fused.removed], changes, added, source, fused.same_distance, settings.mode, notes,
-        time.perf_counter() - start,
+        near, after, rows[fused.removed], changes, added, source, fused.same_distance, settings.mode, notes
     )  # fmt: skip
 
 
@@ -142,7 +137,6 @@ def _write_report(path: Path, done: Completed, object: Path, scene: CloudFile, n
         "notes": quantity(notes, ""),
         "crs": quantity(name, ""),
         "version": quantity(VERSION, ""),
-        "seconds": quantity(done.seconds, "s"),
     }
     write_json(path, content)
 

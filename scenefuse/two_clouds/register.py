@@ -2,7 +2,6 @@
 
 import os
 import shlex
-import time
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
@@ -106,7 +105,6 @@ def register(
         config: YAML of settings that differ from the shipped ones, with the keys of config/config.yaml.
         seed: of all random choices; the config's if not given.
     """
-    start = time.perf_counter()
     settings, shipped_seed = RegistrationSettings.read(config)
     seed = shipped_seed if seed is None else seed
     known.check()
@@ -139,7 +137,6 @@ def register(
         "seed": quantity(seed, ""),
         "notes": quantity(notes, ""),
         "version": quantity(VERSION, ""),
-        "seconds": quantity(time.perf_counter() - start, "s"),
     }
     if not found.registered:
         advice = f"draw a box around the object in {out / BOX_PAGE}, which gives the next command"

@@ -167,7 +167,7 @@ def test_the_same_input_gives_the_same_output_and_is_not_written_to(pair, found,
     for database in databases:
         os.utime(database, (1e9, 1e9))
     again = aligned(tmp_path, *pair)
-    assert again | {"seconds": None} == found | {"seconds": None}
+    assert again == found
     assert [database.stat().st_mtime for database in databases] == [1e9, 1e9]
 
 

@@ -242,7 +242,7 @@ def test_maps_of_patch_match_reach_their_place_from_subfolders_without_leaving_t
     report = read_json(tmp_path / "depth/0.json")
     names = ["walk0/2.png", "walk1/1.png", "walk1/5.png"]
     assert value(report, "backend") == "colmap" and sorted(report["photos"]) == names
-    assert sorted(report["files"]) == [f"{part}/{name}.bin" for part in ("depth_maps", "normal_maps") for name in names]
+    assert read_normals(tmp_path / "depth/0/normal_maps/walk1/5.png.bin").shape == (60, 80, 3)
     # The temporary workspace lay beside the maps, and is gone.
     assert all(folder.is_relative_to(tmp_path / "depth") and not folder.exists() for folder in patch_match)
     assert sorted(p.name for p in (tmp_path / "depth").iterdir()) == ["0", "0.json"]

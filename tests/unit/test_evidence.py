@@ -212,7 +212,7 @@ def test_what_moved_between_flight_and_close_ups_takes_nothing_from_the_scene_an
     obj, scene = sheet(-0.5, 0.5, 0.03).transformed(up), sheet(-0.8, 0.8, 0.06)
     fused, checked = fuse_by_evidence(obj, scene, moved_photos(near, up), far, FusionSettings())
     assert len(fused.removed) == 0
-    notes = value(evidence_report(fused, checked, "m"), "notes")
+    notes = value(evidence_report(fused, checked), "notes")
     assert any("stays where the registration put it" in note for note in notes)
 
 
@@ -221,7 +221,7 @@ def test_a_side_without_photos_is_judged_by_the_other(near, far, without):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.2, 0.06)
     sides = NOBODY if without != "scene" else near, NOBODY if without != "object" else far
     fused, checked = fuse_by_evidence(obj, scene, *sides, FusionSettings())
-    notes = value(evidence_report(fused, checked, "m"), "notes")
+    notes = value(evidence_report(fused, checked), "notes")
     if without == "both":
         assert len(fused.added) == len(fused.removed) == 0 and any("nothing is added" in note for note in notes)
     else:
@@ -250,16 +250,11 @@ def test_every_point_says_what_is_known_of_it(near, far):
     assert (fused.added.fields["photos"] >= 3).all() and (fused.added.fields["deviation"] < 0.02).all()
     beyond = fused.scene.points[:, 0] > 5
     assert not fused.scene.fields["evidence"][beyond].any() and np.isnan(fused.scene.fields["deviation"][beyond]).all()
-    report = evidence_report(fused, checked, "m")
-    checked = value(report, "scene_checked")
-    assert value(report, "scene_measured") + value(report, "scene_stereo_only") == checked == len(fused.rows)
-    assert value(report, "scene_kept") + sum(value(report, "scene_removed").values()) == checked
-    assert value(report, "scene_kept_measured") <= value(report, "scene_measured")
-    photos = fused.added.fields["photos"]
-    assert value(report, "added_photos")["least"] == photos.min() and value(report, "object_measured_share") > 0.9
-    measured = [f"object_{name}" for name in ("added", "better_in_scene")]
-    assert sum(value(report, name) for name in measured) == value(report, "object_measured")
-    assert value(report, "object_measured") + value(report, "object_nerf_only") == value(report, "object_points")
+    report = evidence_report(fused, checked)
+    assert value(report, "scene_checked") == len(fused.rows) >= value(report, "scene_measured") > 0
+    assert sum(value(report, "scene_removed").values()) == len(fused.removed) > 0
+    assert value(report, "object_points") == len(obj) and value(report, "object_measured_share") > 0.9
+    assert value(report, "object_measured") + value(report, "object_contradicted") <= len(obj)
 
 
 def test_a_pot_before_a_wall_stays_where_photos_confirm_it():

@@ -124,7 +124,7 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
         settings=SETTINGS,
     )
     around, report = read_cloud(tmp_path / "fused.ply"), read_json(tmp_path / "fusion.json")
-    assert report["scene_spacing"]["unit"] == "m"
+    assert report["fill_distance"]["unit"] == "m"
     added = value(report, "added_points")
     assert (added > 0) == (status != "unregistered") and value(report, "registration") == status
     assert (around.fields["source"] == 1).sum() == added

@@ -81,7 +81,7 @@ def test_the_side_without_photos_was_never_seen_and_stations_stand_before_it(hal
         missing.share(Lack.NEVER_SEEN) > 0.1
         and missing.share(Lack.UNTEXTURED) + missing.share(Lack.CONTRADICTED) < 0.02
     )
-    plan = plan_stations(missing, cloud, cloud, photos.views, UP)
+    plan = plan_stations(missing, cloud, cloud, photos.views)
     # The photos are from y > 0.
     assert all(station.photos[1].centre[1] < CENTER[1] for station in plan.stations)
     assert plan.stations[0].shows > 0.3 and plan.reachable > 0.5
@@ -103,7 +103,7 @@ def test_points_that_no_photo_confirms_are_told_apart_by_texture(waves, kind):
     missing = find_missing_surface(obj, obj[~gone], (photos, NOBODY), masks)
     top = missing.cells[missing.cells.points[:, 2] > CENTER[2]]
     assert len(top) > 100 and (top.fields["missing"] == kind).mean() > 0.9
-    stations = plan_stations(missing, obj, obj, photos.views, UP).stations
+    stations = plan_stations(missing, obj, obj, photos.views).stations
     assert (len(stations) > 0 and stations[0].photos[1].centre[2] > CENTER[2]) == (kind == Lack.CONTRADICTED)
 
 
@@ -112,7 +112,7 @@ def test_what_photos_see_through_is_not_missing(half):
     floating = Cloud(CENTER + [0, RADIUS + 0.4, 0] + 0.2 * (ball(500).points - CENTER), ball(500).normals)
     alone = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
     both = find_missing_surface(concatenate([cloud, floating]), cloud, (photos, NOBODY), masks)
-    assert both.seen_through > 200 and abs(both.share(Lack.NEVER_SEEN) - alone.share(Lack.NEVER_SEEN)) < 0.05
+    assert abs(both.share(Lack.NEVER_SEEN) - alone.share(Lack.NEVER_SEEN)) < 0.05
     assert not (both.cells.points[:, 1] > CENTER[1] + RADIUS).any()
 
 
@@ -120,7 +120,7 @@ def test_without_masks_only_the_own_points_count_and_a_note_says_so(half):
     photos, _, cloud = half
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), [])
     assert len(missing.cells) == 0 and "0 masks" in missing.notes[0]
-    assert plan_stations(missing, cloud, cloud, photos.views, UP) == Plan([], 0.0)
+    assert plan_stations(missing, cloud, cloud, photos.views) == Plan([], 0.0)
 
 
 def test_no_station_lies_below_the_ground_or_in_a_wall(half):
@@ -130,7 +130,7 @@ def test_no_station_lies_below_the_ground_or_in_a_wall(half):
     ground = Cloud(CENTER + np.stack([x, y, np.full_like(x, -RADIUS)], 1), np.tile(np.float32([0, 0, 1]), (len(x), 1)))
     # A wall right behind the sphere: from beyond it nothing is seen.
     wall = Cloud(CENTER + np.stack([x, np.full_like(x, -4.0), y], 1), np.tile(np.float32([0, 1, 0]), (len(x), 1)))
-    plan = plan_stations(missing, cloud, concatenate([cloud, ground, wall]), photos.views, UP)
+    plan = plan_stations(missing, cloud, concatenate([cloud, ground, wall]), photos.views)
     eyes = np.array([view.centre for station in plan.stations for view in station.photos]) - CENTER
     assert len(eyes) and (eyes[:, 2] > -RADIUS).all() and (eyes[:, 1] > -4.0).all()
 
@@ -138,9 +138,9 @@ def test_no_station_lies_below_the_ground_or_in_a_wall(half):
 def test_rows_say_where_to_stand_and_where_to_look(half):
     photos, masks, cloud = half
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
-    plan = plan_stations(missing, cloud, cloud, photos.views, UP)
+    plan = plan_stations(missing, cloud, cloud, photos.views)
     frame = LocalFrame(47.4, 8.5, 400.0)
-    rows = photo_rows(plan, photos.views, UP, frame)
+    rows = photo_rows(plan, photos.views, frame)
     assert len(rows) == 3 * len(plan.stations) and set(rows[0]) == set(COLUMNS)
     for row in rows:
         eye = np.array([row[axis] for axis in "xyz"])
@@ -151,9 +151,9 @@ def test_rows_say_where_to_stand_and_where_to_look(half):
         assert looks @ ahead > 0.99 * np.linalg.norm(ahead)
         highest = max(view.centre[2] for view in photos.views)
         assert row["above_close_ups"] == pytest.approx(eye[2] - highest, abs=1e-3)
-    assert "longitude_deg" not in photo_rows(plan, photos.views, UP, None)[0]
+    assert "longitude_deg" not in photo_rows(plan, photos.views, None)[0]
     # GPS may count heights from another zero than the scene does.
-    higher = photo_rows(plan, photos.views, UP, frame, gps_higher=47.0)
+    higher = photo_rows(plan, photos.views, frame, gps_higher=47.0)
     assert {round(b["altitude_m"] - a["altitude_m"], 2) for a, b in zip(rows, higher)} == {47.0}
 
 
@@ -162,7 +162,7 @@ def test_an_object_of_which_nothing_came_into_the_scene_is_missing_as_a_whole(ha
     nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
     missing = find_missing_surface(cloud, nothing, (photos, NOBODY), masks)
     assert missing.covered_cells == 0 and len(missing.cells) > 1000
-    assert plan_stations(missing, cloud, nothing, photos.views, UP) == Plan([], 0.0)
+    assert plan_stations(missing, cloud, nothing, photos.views) == Plan([], 0.0)
 
 
 @pytest.fixture
@@ -182,11 +182,10 @@ def files(tmp_path, half):
     write_changes(tmp_path, cloud, cloud[:0])
     fusion = {"status": "fused", "reason": "", "scene_from_object": Sim3.identity().matrix}
     write_json(tmp_path / "fusion.json", {k: quantity(v, "") for k, v in fusion.items()})
-    write_json(tmp_path / "crop.json", {"level_from_scene": quantity(np.eye(3), "")})
     write_json(tmp_path / "georeference.json", {"length_unit": quantity("m", ""), **{
         f"origin_{k}": quantity(v, "") for k, v in (("latitude_deg", 47.4), ("longitude_deg", 8.5), ("altitude_m", 400))
     }})  # fmt: skip
-    names = ("object.ply", "dense.ply", "fused.ply", "checked.ply", "fusion.json", "crop.json", "georeference.json")
+    names = ("object.ply", "dense.ply", "fused.ply", "checked.ply", "fusion.json", "georeference.json")
     inputs = MissingInputs(*(tmp_path / name for name in (*names, "object", "scene", "masks")))
     outputs = MissingOutputs(*(tmp_path / name for name in ("missing.ply", "next.csv", "next.geojson", "missing.json")))
     return inputs, outputs

@@ -15,7 +15,6 @@ from scenefuse.core.stage import (
     StageError,
     atomic_directory,
     atomic_file,
-    manifest,
     quantity,
     read_json,
     remove_leftovers,
@@ -174,13 +173,6 @@ def test_damaged_json_is_named(tmp_path):
         read_json(tmp_path / "a.json")
     with pytest.raises(StageError, match=r"b\.json does not exist"):
         read_json(tmp_path / "b.json")
-
-
-def test_manifest_names_contents_and_ignores_snakemake(tmp_path):
-    (tmp_path / "d").mkdir()
-    (tmp_path / "d" / "a").write_text("a")
-    (tmp_path / ".snakemake_timestamp").write_text("")
-    assert list(manifest(tmp_path)) == ["d/a"]
 
 
 @pytest.mark.process

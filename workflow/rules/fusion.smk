@@ -58,7 +58,6 @@ rule find_missing:
         fused="results/objects/{object}/fused.ply",
         checked="results/objects/{object}/checked.ply",
         fusion="results/objects/{object}/fusion.json",
-        crop_json="results/objects/{object}/registration/full/crop.json",
         object_workspace=judging_photos,
         scene_workspace=in_photographed_scene("undistorted"),
         masks=if_masked("results/objects/{object}/masks"),
@@ -86,8 +85,7 @@ rule find_missing:
         "{wildcards.object}: what is still missing"
     shell:
         "exec python {params.script} --object {input.cloud} --scene {input.scene} --fused {input.fused} --checked {input.checked}"
-        " --fusion-json {input.fusion}"
-        " --crop-json {input.crop_json} {params.photos} --georeference-json {input.georeference}"
+        " --fusion-json {input.fusion} {params.photos} --georeference-json {input.georeference}"
         " --missing {output.missing} --next-photos {output.photos} --geojson {output.geojson} --report {output.report} &> {log}"
 
 
