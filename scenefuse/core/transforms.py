@@ -161,6 +161,15 @@ def rotation_between(a: Array, b: Array) -> Array:
     return np.eye(3) + k + k @ k / (1.0 + cosine)
 
 
+def apart(pose: "Sim3", other: "Sim3", at: Array) -> Array:
+    """(3,) how two poses differ: by log scale, by rotation in degrees, and where (3,) of the object lies."""
+    return np.array([
+        abs(np.log(other.scale / pose.scale)),
+        rotation_angle_deg(other.rotation @ pose.rotation.T),
+        np.linalg.norm(other.apply(at) - pose.apply(at)),
+    ])  # fmt: skip
+
+
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:
     """(3, 3) cam_from_world rotation of a camera at `eye` that looks at `target` with `up` upwards in the image."""
     forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)

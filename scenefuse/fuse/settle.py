@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
 from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.fuse.measure import RESOLUTION
-from scenefuse.geometry.icp import ScaleRange, refine_planes
+from scenefuse.geometry.icp import ScaleRange, change_between, refine_planes
 from scenefuse.geometry.surface import SAMPLED_POINTS, SCORE_FRACTION, Surface, with_queries
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.likelihood import PIECES_ACROSS
@@ -24,9 +23,7 @@ MIN_MISPLACED = FineSettings.max_translation_sd_fraction
 HALVES = 6
 
 
-def settle(
-    obj: Cloud, scene: Cloud, diagonal: float, certain: float | None = None, seed: int = 0
-) -> tuple[Sim3, float] | None:
+def settle(obj: Cloud, scene: Cloud, diagonal: float, certain: float | None = None) -> tuple[Sim3, float] | None:
     """The similarity that lays measured points of an object on those of the scene, and how far it moves them.
 
     The registration worked on whole clouds, with what stereo made up at edges and the NeRF where nothing was seen; here
@@ -40,7 +37,6 @@ def settle(
         scene: the scene's around them, likewise.
         diagonal: of the object.
         certain: `size` of the registration's uncertainty on the scene, over the diagonal; None where it is not known.
-        seed: of the drawing.
 
     Returns:
         settled_from_placed and the RMS distance that it moves the object's points, over the diagonal; None where a side
@@ -49,9 +45,9 @@ def settle(
     """
     if min(len(obj), len(scene)) < MIN_POINTS:
         return None
-    mine, theirs = _surface(obj, seed), _surface(scene, seed)
+    mine, theirs = _surface(obj), _surface(scene)
     pose, scales = _refined(mine, theirs, DISTINCT_SCALE_LOG, diagonal), ScaleRange(1.0, DISTINCT_SCALE_LOG)
-    spread = half_sampling(mine, theirs, pose, scales, SCORE_FRACTION * diagonal, HALVES, seed)
+    spread = half_sampling(mine, theirs, pose, scales, SCORE_FRACTION * diagonal)
     if spread is None or spread.size(diagonal) > MIN_MISPLACED:
         pose = _refined(mine, theirs, 0.0, diagonal)
     moved = float(np.sqrt(((pose.apply(obj.points) - obj.points) ** 2).sum(1).mean())) / diagonal
@@ -68,20 +64,17 @@ def _refined(mine: Surface, theirs: Surface, scale_width: float, diagonal: float
     return pose
 
 
-def _surface(cloud: Cloud, seed: int) -> Surface:
+def _surface(cloud: Cloud) -> Surface:
     """A cloud made ready for refinement: drawn evenly, since averages would round corners off; a quarter queries."""
-    rng = np.random.default_rng(seed)
-    thin = cloud[np.sort(rng.permutation(len(cloud))[:SAMPLED_POINTS])]
+    thin = cloud[np.sort(np.random.default_rng(0).permutation(len(cloud))[:SAMPLED_POINTS])]
     colors = None if thin.colors is None else thin.colors / 255.0
     assert thin.normals is not None
     normals = thin.normals.astype(np.float64)
     surface = Surface(thin.points, normals, colors, cKDTree(thin.points), np.arange(len(thin)))
-    return with_queries(surface, SAMPLED_POINTS // 4, seed)
+    return with_queries(surface, SAMPLED_POINTS // 4)
 
 
-def half_sampling(
-    obj: Surface, scene: Surface, pose: Sim3, scales: ScaleRange, tau: float, halves: int, seed: int
-) -> Uncertainty | None:
+def half_sampling(obj: Surface, scene: Surface, pose: Sim3, scales: ScaleRange, tau: float) -> Uncertainty | None:
     """Half-sampling (Politis, Romano 1994): refine again and again with half of the surface's pieces, drawn at random.
 
     The deviation of a half's pose from the whole's has the spread that the whole's has from the truth. New pairs are
@@ -93,16 +86,14 @@ def half_sampling(
         pose: scene_from_object of the whole.
         scales: bounds of the scale.
         tau: see `refine_planes`.
-        halves: how many are drawn.
-        seed: of the halves.
 
     Returns:
         None with no more pieces to draw from than a pose has parameters.
     """
-    centre, rng = obj.points.mean(0), np.random.default_rng(seed)
+    centre, rng = obj.points.mean(0), np.random.default_rng(0)
     edge = float(np.linalg.norm(np.ptp(scene.points, axis=0))) / PIECES_ACROSS
-    deviations = np.zeros((halves, 7))
-    for k in range(halves):
+    deviations = np.zeros((HALVES, 7))
+    for k in range(HALVES):
         half = _half(obj, scene, pose, edge, rng)
         if half is None:
             return None
@@ -110,10 +101,8 @@ def half_sampling(
         factor = 1 + DISTINCT_SCALE_LOG if k % 2 else 1 / (1 + DISTINCT_SCALE_LOG)
         start = Sim3(factor, np.eye(3), (1 - factor) * pose.apply(centre)) @ pose
         other = refine_planes(*half, start, scales, tau, rounds=30)
-        deviations[k, :3] = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()
-        deviations[k, 3:6] = other.apply(centre) - pose.apply(centre)
-        deviations[k, 6] = np.log(other.scale / pose.scale)
-    return Uncertainty.of(deviations.T @ deviations / halves)
+        deviations[k] = change_between(pose, other, centre)
+    return Uncertainty.of(deviations.T @ deviations / HALVES)
 
 
 def _half(

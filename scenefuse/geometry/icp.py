@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from scenefuse.cloud.cloud_file import NEIGHBOURS
+from scenefuse.cloud.clouds import plane_normals
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import SD_OVER_MEDIAN, Array, Sim3, fit_sim3
 from scenefuse.geometry.surface import SAMPLED_POINTS, Pairs, Surface, color_gain, pair
@@ -104,25 +106,23 @@ def refine_planes(
     return pose
 
 
-def refine_on_cloud(own: Array, points: Array, steps: int = 20, neighbours: int = 8) -> Sim3:
+def refine_on_cloud(own: Array, points: Array) -> Sim3:
     """The similarity that lays a model's own points (M, 3) on a cloud (N, 3), both nearly in the same place.
 
     Point to plane (Chen and Medioni 1992), of the nearest 70 % at each step (trimmed ICP, Chetverikov et al. 2005); a
     plane is fitted to the neighbours in the cloud.
     """
     own, tree, found = own[:: max(1, len(own) // SAMPLED_POINTS)], cKDTree(points), Sim3.identity()
-    for _ in range(steps):
+    for _ in range(20):
         moved = found.apply(own)
-        distance, near = tree.query(moved, neighbours, workers=threads())
-        rows = np.argsort(distance[:, 0])[: max(neighbours, int(NEAREST_SHARE * len(own)))]
-        around = points[near[rows]]
-        middle = around.mean(1)
-        normals = np.linalg.eigh(np.einsum("nki,nkj->nij", *[around - middle[:, None]] * 2))[1][:, :, 0]
+        distance, near = tree.query(moved, NEIGHBOURS, workers=threads())
+        rows = np.argsort(distance[:, 0])[: max(NEIGHBOURS, int(NEAREST_SHARE * len(own)))]
+        normals, middle = plane_normals(points, near[rows]), points[near[rows]].mean(1)
         found = step_to_planes(found, moved[rows], normals, ((moved[rows] - middle) * normals).sum(1))
     return found
 
 
-def step_to_planes(pose: Sim3, moved: Array, normals: Array, off: Array, weights: Array | None = None) -> Sim3:
+def step_to_planes(pose: Sim3, moved: Array, normals: Array, off: Array) -> Sim3:
     """A pose after one step of Gauss-Newton that brings points to planes (Chen and Medioni 1992).
 
     Args:
@@ -130,13 +130,9 @@ def step_to_planes(pose: Sim3, moved: Array, normals: Array, off: Array, weights
         moved: (N, 3) the points at that pose.
         normals: (N, 3) unit normals of their planes.
         off: (N,) distances from these, along the normals.
-        weights: (N,) of the rows; all alike without them.
     """
     centre = moved.mean(0)
-    rows = similarity_rows(moved - centre, normals)
-    if weights is not None:
-        rows, off = rows * weights[:, None], off * weights
-    step = np.asarray(-np.linalg.lstsq(rows, off, rcond=None)[0], dtype=np.float64)
+    step = np.asarray(-np.linalg.lstsq(similarity_rows(moved - centre, normals), off, rcond=None)[0], np.float64)
     return moved_about(pose, step, centre, ScaleRange(1.0, np.inf), 2 * MAX_SCALE_STEP)
 
 
@@ -157,6 +153,13 @@ def moved_about(
     factor = float(np.exp(np.clip(step[6], -max_scale_step, max_scale_step)))
     growth = scales.clamp(pose.scale * factor) / pose.scale
     return Sim3(growth, rotation, centre + step[3:6] - growth * (rotation @ centre)) @ pose
+
+
+def change_between(pose: Sim3, other: Sim3, at: Array) -> Array:
+    """(7,) what `moved_about` undoes: rotation vector, shift and log scale from a pose to another, about where both
+    have (3,) of the object."""
+    turn = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()
+    return np.array([*turn, *(other.apply(at) - pose.apply(at)), np.log(other.scale / pose.scale)])
 
 
 def _motion(step: Array, rows: "_Rows") -> float:

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3
 from scenefuse.crop.crop_scene import MIN_POINTS
-from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, moved_about, similarity_rows
+from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, change_between, moved_about, similarity_rows
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface
 from scenefuse.register.score import MIN_COLOR_NOISE
 from scenefuse.register.uncertainty import Uncertainty
@@ -288,9 +287,7 @@ def _off_on_copies(
         copy = Surface(points, normals, colors, cKDTree(points), np.arange(len(points)))
         # Half of the points lie farther apart.
         again = most_likely(mine, copy, found.pose, scales, np.sqrt(2) * spacing, diagonal).pose
-        turn = Rotation.from_matrix(again.rotation @ found.pose.rotation.T).as_rotvec()
-        centre = found.pose.inverse().apply(found.centre)
-        off.append([*turn, *(again.apply(centre) - found.centre), np.log(again.scale / found.pose.scale)])
+        off.append(change_between(found.pose, again, found.pose.inverse().apply(found.centre)))
     return np.array(off)
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, voxel_downsample
 from scenefuse.core.stage import StageError, quantity, read_json, value
-from scenefuse.core.transforms import UP, Array, Sim3, along_a_line, rotation_angle_deg, rotation_between
+from scenefuse.core.transforms import UP, Array, Sim3, along_a_line, apart, rotation_between
 from scenefuse.geometry.depth_test import FreeSpace
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare
@@ -74,14 +74,8 @@ class Alignment:
 
     def agrees(self, pose: Sim3, centre: Array, diagonal: float, times: float = 1.0) -> bool:
         """Whether a pose lies within `times` three standard deviations; at least 3 %, 3 degrees, 3 % of the size."""
-        scale = abs(np.log(pose.scale / self.pose.scale))
-        angle = rotation_angle_deg(pose.rotation @ self.pose.rotation.T)
-        shift = float(np.linalg.norm(pose.apply(centre) - self.pose.apply(centre)))
-        return bool(
-            scale <= times * max(0.03, 3 * self.uncertainty.scale_sd_log)
-            and angle <= times * max(3.0, 3 * self.uncertainty.rotation_sd_deg)
-            and shift <= times * max(0.03 * diagonal, 3 * self.uncertainty.translation_sd)
-        )
+        allowed = np.maximum([0.03, 3.0, 0.03 * diagonal], 3 * self.uncertainty.deviations)
+        return bool((apart(self.pose, pose, centre) <= times * allowed).all())
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.geometry.icp import ScaleRange, moved_about
+from scenefuse.geometry.icp import ScaleRange, moved_about, similarity_rows
 from scenefuse.register.landmarks import Landmarks
 from scenefuse.register.uncertainty import Uncertainty
 
@@ -107,15 +107,15 @@ def match_errors(seen: Observations, scene_from_object: Sim3) -> Array:
     return np.sqrt(np.maximum(*sides))
 
 
-def minimise_reprojection(seen: Observations, start: Sim3, width_px: float, rounds: int = 20) -> Sim3:
+def minimise_reprojection(seen: Observations, start: Sim3, width_px: float) -> Sim3:
     """Gauss-Newton over the seven parameters with Cauchy weights of `width_px`, damped where it does not improve."""
     pose, damping = start, 1e-6
     cost = _cost(seen, pose, width_px)
-    for _ in range(rounds):
+    for _ in range(20):
         jacobian, error, weights = _linearise(seen, pose, width_px)
         normal, gradient = _normal(jacobian, error, weights)
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient).astype(np.float64)
-        moved = _moved(seen, pose, step)
+        moved = moved_about(pose, step, _pivot(seen, pose), ScaleRange(1.0, np.inf), np.inf)
         lower = _cost(seen, moved, width_px)
         if lower < cost:
             pose, damping, done = moved, damping / 10, cost - lower < 1e-9 * cost
@@ -156,10 +156,10 @@ def bootstrap(seen: Observations, pose: Sim3, width_px: float, at: Array, draws:
         photos = np.concatenate([redrawn(seen.photo[: seen.forward]), redrawn(seen.photo[seen.forward :])])
         normal, gradient = _normal(jacobian, error, weights * redrawn(seen.match) * photos)
         step = np.linalg.lstsq(normal, -gradient, rcond=1e-12)[0]
-        steps.append(np.concatenate([step[:4], step[0] * lever + np.cross(step[1:4], lever) + step[4:]]))
-    deviation = np.std(steps, axis=0)
-    turn, shift = np.linalg.norm(deviation[1:4]), np.linalg.norm(deviation[4:])
-    return Uncertainty.even(float(deviation[0]), float(np.degrees(turn)), float(shift))
+        shift = step[3:6] + np.cross(step[:3], lever) + step[6] * lever
+        steps.append([*step[:3], *shift, step[6]])
+    turn, shift, scale = (float(np.linalg.norm(part)) for part in np.split(np.std(steps, axis=0), [3, 6]))
+    return Uncertainty.even(scale, float(np.degrees(turn)), shift)
 
 
 def _gain(seen: Observations, scale: float) -> Array:
@@ -180,17 +180,12 @@ def _cost(seen: Observations, pose: Sim3, width_px: float) -> float:
 
 
 def _linearise(seen: Observations, pose: Sim3, width_px: float) -> tuple[Array, Array, Array]:
-    """Jacobian (K, 2, 7) of the errors by log scale, rotation about the pivot and shift; errors; Cauchy weights."""
+    """Jacobian (K, 2, 7) of the errors by rotation about the pivot, shift and log scale; errors; Cauchy weights."""
     n, pivot = seen.forward, _pivot(seen, pose)
     error, in_cam = residuals(seen, pose)
-    # A step moves the scene's copy of a point by sigma (p - c) + omega x (p - c) + tau; seen from the object, the
-    # scene's point moves the other way.
+    # Seen from the object, the scene's copy of a point moves the other way.
     lever = np.concatenate([pose.apply(seen.x)[seen.match[:n]], seen.y[seen.match[n:]]]) - pivot
-    motion = np.zeros((len(lever), 3, 7))
-    motion[:, :, 0] = lever
-    for axis in range(3):
-        motion[:, :, 1 + axis] = np.cross(np.eye(3)[axis], lever)
-    motion[:, :, 4:] = np.eye(3)
+    motion = similarity_rows(*np.broadcast_arrays(lever[:, None], np.eye(3)))
     motion[n:] = -(pose.rotation.T / pose.scale) @ motion[n:]
     in_camera = seen.pose[:, :, :3] @ motion
     depth = np.maximum(in_cam[:, 2], 1e-12)[:, None, None]
@@ -210,9 +205,3 @@ def _normal(jacobian: Array, error: Array, weights: Array) -> tuple[Array, Array
 def _pivot(seen: Observations, pose: Sim3) -> Array:
     """The middle of the matched points, about which steps turn and scale."""
     return pose.apply(np.median(seen.x, axis=0))
-
-
-def _moved(seen: Observations, pose: Sim3, step: Array) -> Sim3:
-    """The pose after a step of log scale, rotation vector and shift about the pivot."""
-    order = [1, 2, 3, 4, 5, 6, 0]
-    return moved_about(pose, step[order], _pivot(seen, pose), ScaleRange(1.0, np.inf), np.inf)

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, sampled
 from scenefuse.core.stage import quantity, threads
-from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
+from scenefuse.core.transforms import Array, Sim3, apart
 from scenefuse.geometry.depth_test import FreeSpace
 from scenefuse.geometry.surface import NORMAL_NEIGHBOURS, SAMPLED_POINTS, Pairs, Surface, normals_at, pair
 
@@ -169,10 +169,7 @@ def distinct(
     shift: float = DISTINCT_SHIFT,
 ) -> bool:
     """Whether two poses differ by more than an angle, 6 % of scale or, at the object's centre, `shift` diagonals."""
-    apart = np.linalg.norm(a.apply(centre) - b.apply(centre))
-    turn = rotation_angle_deg(a.rotation @ b.rotation.T)
-    scale_log = abs(np.log(a.scale / b.scale))
-    return bool(turn > angle_deg or scale_log > DISTINCT_SCALE_LOG or apart > shift * diagonal)
+    return bool((apart(a, b, centre) > [DISTINCT_SCALE_LOG, angle_deg, shift * diagonal]).any())
 
 
 @dataclass(frozen=True)

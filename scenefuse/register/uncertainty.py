@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from scenefuse.core.stage import quantity, threads
-from scenefuse.core.transforms import UP, Array, Sim3, rotation_angle_deg
+from scenefuse.core.transforms import UP, Array, Sim3, apart
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import Surface
 
@@ -63,23 +63,14 @@ class Uncertainty:
 
     def with_difference(self, pose: Sim3, other: Sim3, at: Array) -> "Uncertainty":
         """With the difference of two estimates of the pose, taken at (3,) in the object's frame, added in squares."""
-        return Uncertainty.even(*np.hypot(self.deviations, _apart(pose, other, at)))
+        return Uncertainty.even(*np.hypot(self.deviations, apart(pose, other, at)))
 
-    def unless_apart(self, pose: Sim3, other: Sim3, at: Array, of_other: "Uncertainty") -> "Uncertainty":
+    def unlessapart(self, pose: Sim3, other: Sim3, at: Array, of_other: "Uncertainty") -> "Uncertainty":
         """At least what two estimates differ by beyond the other's own uncertainty; see `with_difference`."""
-        beyond = np.sqrt(np.maximum(_apart(pose, other, at) ** 2 - of_other.deviations**2, 0))
+        beyond = np.sqrt(np.maximum(apart(pose, other, at) ** 2 - of_other.deviations**2, 0))
         if (beyond <= self.deviations).all():
             return self
         return Uncertainty.even(*np.maximum(self.deviations, beyond))
-
-
-def _apart(pose: Sim3, other: Sim3, at: Array) -> Array:
-    """(3,) differences of log scale, rotation (degrees), and where (3,) in the object's frame lies (scene units)."""
-    return np.array([
-        abs(np.log(other.scale / pose.scale)),
-        rotation_angle_deg(other.rotation @ pose.rotation.T),
-        np.linalg.norm(other.apply(at) - pose.apply(at)),
-    ])  # fmt: skip
 
 
 def with_bending(local: Uncertainty, pose: Sim3, of_object: Array | None, of_scene: Array | None) -> Uncertainty:

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
+from scenefuse.geometry.icp import change_between
 from scenefuse.photos.workspace import read_model
 from scenefuse.sfm.colmap import MIN_PHOTOS, adjust
 from scenefuse.sfm.lens import LENSES, MAX_POINTS, Lens
@@ -59,8 +59,7 @@ class Spread:
             seen = np.isfinite(moved).all(1)
             if seen.sum() >= MIN_PHOTOS:
                 motion = _common_motion(self.points[near][seen], moved[seen])
-                turn = Rotation.from_matrix(motion.rotation).as_rotvec()
-                deviations.append([*turn, *(motion.apply(place) - place), np.log(motion.scale)])
+                deviations.append(change_between(Sim3.identity(), motion, place))
                 whole.append(counts_whole)
         deviation, counts = np.array(deviations).reshape(-1, 7), np.array(whole, dtype=bool)
         left_out, richer = deviation[~counts], deviation[counts]

@@ -315,8 +315,9 @@ def surface_alignment(points: Array, known: ObjectTruth) -> Sim3:
         moved = found.apply(points)
         normals = _normals_there(moved, known)
         off = (_to_surface(moved, known) * normals).sum(1)
+        # Rows of shorter normals and distances weigh less.
         weights = 1 / np.sqrt(np.maximum(1, np.abs(off) / (1.5 * np.median(np.abs(off)))))
-        found = step_to_planes(found, moved, normals, off, weights)
+        found = step_to_planes(found, moved, normals * weights[:, None], off * weights)
     return found
 
 

@@ -332,7 +332,7 @@ def test_refinement_undoes_a_wrong_start(pair):
     tilt = Rotation.from_rotvec([0.06, -0.03, 0.09]).as_matrix()
     start = Sim3(1.06, tilt, np.array([0.15, 0.06, -0.12])) @ truth
     assert np.median(match_errors(seen, start)) > 6
-    found = minimise_reprojection(seen, start, 3.0, 30)
+    found = minimise_reprojection(seen, start, 3.0)
     assert np.median(match_errors(seen, found)) < 2
     assert found.scale == pytest.approx(truth.scale, rel=3e-3)
 

@@ -174,7 +174,7 @@ def test_spread_of_a_pose_grows_with_noise():
             points = rng.normal(size=(3000, 3))
             points /= np.linalg.norm(points, axis=1, keepdims=True)
             eggs.append(prepare(Cloud((points + noise * rng.normal(size=(3000, 3))) * [1, 1.3, 1.6]), 0.05, 0, 3000))
-        return half_sampling(*eggs, Sim3.identity(), ScaleRange(1.0, 0.2), 0.1, halves=10, seed=0)
+        return half_sampling(*eggs, Sim3.identity(), ScaleRange(1.0, 0.2), 0.1)
 
     fine, rough = spread(0.002), spread(0.02)
     assert fine.scale_sd_log < rough.scale_sd_log
