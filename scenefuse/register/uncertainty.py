@@ -65,7 +65,7 @@ class Uncertainty:
         """With the difference of two estimates of the pose, taken at (3,) in the object's frame, added in squares."""
         return Uncertainty.even(*np.hypot(self.deviations, apart(pose, other, at)))
 
-    def unlessapart(self, pose: Sim3, other: Sim3, at: Array, of_other: "Uncertainty") -> "Uncertainty":
+    def unless_apart(self, pose: Sim3, other: Sim3, at: Array, of_other: "Uncertainty") -> "Uncertainty":
         """At least what two estimates differ by beyond the other's own uncertainty; see `with_difference`."""
         beyond = np.sqrt(np.maximum(apart(pose, other, at) ** 2 - of_other.deviations**2, 0))
         if (beyond <= self.deviations).all():
