@@ -285,22 +285,6 @@ def true_depth(
     return hits["t_hit"].numpy(), hits["geometry_ids"].numpy().view(np.int32).astype(np.int64)
 
 
-def belongs_to_object(
-    points: Array,
-    to_object: NDArray[np.floating],
-    to_world: NDArray[np.floating],
-    low: Array,
-    high: Array,
-    margin: float,
-) -> NDArray[np.bool_]:
-    """(N,) points that count as the object's: inside its box widened by `margin`, nearer to it than to the rest.
-
-    The ground and clutter around the object thus count neither for nor against a cloud.
-    """
-    inside = ((points >= low - margin) & (points <= high + margin)).all(1)
-    return inside & (to_object < to_world)
-
-
 @dataclass(frozen=True)
 class RegistrationError:
     """An estimated scene_from_object against the true one."""

@@ -97,9 +97,6 @@ class Registration:
     """What came out.
 
     Attributes:
-        registered: whether the pose may be used.
-        reason: one sentence why, or why not.
-        scene_from_object: the best pose found, between the clouds' own coordinates; None where nothing gave a pose.
         outcome: refined hypotheses and decision, relative to `origins`; None where nothing gave a pose.
         origins: the (3,) points subtracted from the object's and the scene's coordinates.
         scales: the scale prior.
@@ -107,9 +104,6 @@ class Registration:
         unit: of the scene's lengths.
     """
 
-    registered: bool
-    reason: str
-    scene_from_object: Sim3 | None
     outcome: Outcome | None
     origins: tuple[Array, Array]
     scales: ScaleRange
@@ -117,37 +111,27 @@ class Registration:
     unit: str = "scene units"
 
     @property
+    def registered(self) -> bool:
+        """Whether the pose may be used."""
+        return self.outcome is not None and self.outcome.decision.registered
+
+    @property
+    def reason(self) -> str:
+        """One sentence why, or why not."""
+        return "neither features nor gravity gave a pose" if self.outcome is None else self.outcome.decision.reason
+
+    @property
+    def scene_from_object(self) -> Sim3 | None:
+        """The best pose found, between the clouds' own coordinates; None where nothing gave a pose."""
+        if self.outcome is None:
+            return None
+        from_object, to_scene = (Sim3(1.0, np.eye(3), shift) for shift in (-self.origins[0], self.origins[1]))
+        return to_scene @ self.outcome.ranked[0].pose @ from_object
+
+    @property
     def total(self) -> float:
         """The score that poses are ranked by; 0 where nothing gave a pose."""
         return 0.0 if self.outcome is None else self.outcome.ranked[0].score.total
-
-
-def register_clouds(
-    obj: Cloud,
-    scene: Cloud,
-    settings: RegistrationSettings,
-    seed: int,
-    *,
-    ups: tuple[Array, Array] | None = None,
-    scales: ScaleRange | None = None,
-    unit: str = "scene units",
-) -> Registration:
-    """Find where an object lies in a scene: scale, coarse and fine registration as in the workflow, and the gate.
-
-    Args:
-        obj: the object, any frame and unit.
-        scene: the scene's points around it (see `cut_scene`), any frame and unit; far origins lose no precision.
-        settings: of all steps.
-        seed: of all random choices.
-        ups: up directions in the object's and in the scene's frame; None where one of them is not known.
-        scales: scene units per object unit; None to estimate them from both extents.
-        unit: what the scene's lengths are counted in, for the report.
-
-    Raises:
-        StageError: too few different points, or all in one place or along one line, on either side.
-    """
-    found = refined(search(obj, scene, settings, seed, ups, scales), settings, unit)
-    return with_agreement(found, obj, scene, settings, seed)
 
 
 @dataclass(frozen=True)
@@ -178,7 +162,7 @@ def search(
     ups: tuple[Array, Array] | None,
     scales: ScaleRange | None,
 ) -> Search:
-    """The coarse registration; arguments and errors as of `register_clouds`."""
+    """The coarse registration; arguments and errors as of `find_in_scene`."""
     for name, cloud in (("the object", obj), ("the scene", scene)):
         _check_points(cloud, name)
     origins = np.floor(obj.points.mean(0)), np.floor(scene.points.mean(0))
@@ -191,13 +175,9 @@ def search(
 
 def refined(found: Search, settings: RegistrationSettings, unit: str) -> Registration:
     """The fine registration of what a search found, and the decision."""
-    scales, origins = found.problem.scales, found.origins
-    if not found.hypotheses:
-        return Registration(False, "neither features nor gravity gave a pose", None, None, origins, scales, {})
     starts = [(hypothesis.pose, hypothesis.source) for hypothesis in found.hypotheses]
-    outcome = refine_hypotheses(found.problem, starts, settings.fine)
-    whole = Sim3(1.0, np.eye(3), origins[1]) @ outcome.ranked[0].pose @ Sim3(1.0, np.eye(3), -origins[0])
-    return Registration(outcome.decision.registered, outcome.decision.reason, whole, outcome, origins, scales, {}, unit)
+    outcome = refine_hypotheses(found.problem, starts, settings.fine) if starts else None
+    return Registration(outcome, found.origins, found.problem.scales, {}, unit)
 
 
 def with_agreement(
@@ -222,25 +202,35 @@ def find_in_scene(
     up_in_scene: Array | None = None,
     scales: ScaleRange | None = None,
     unit: str = "scene units",
+    marked: bool = False,
 ) -> tuple[Registration, Cloud, list[tuple[float, Array]]]:
     """Find where an object lies in a scene that may be thirty times as wide (method R16).
 
     It is searched in the whole scene, as if that showed little else, and in each of `likely_places`; the best coarse
-    poses are refined. The best has to lead over those elsewhere as over other poses.
+    poses are refined. The best has to lead over those elsewhere as over other poses. Scale, coarse and fine
+    registration and the gate are those of the workflow.
 
     Args:
-        obj, scene, settings, seed, ups, scales, unit: as of `register_clouds`.
+        obj: the object, any frame and unit.
+        scene: the scene's points, or a part of them (see `cut_scene`), any frame and unit; far origins lose no
+            precision.
+        settings: of all steps.
+        seed: of all random choices.
+        ups: up directions in the object's and in the scene's frame; None where one of them is not known.
         up_in_scene: unit vector (3,), opposite to gravity; None where it is not known.
+        scales: scene units per object unit; None to estimate them from both extents.
+        unit: what the scene's lengths are counted in, for the report.
+        marked: the points are those of a place that was marked: no parts of it are tried.
 
     Returns:
         The best registration, the part of the scene that it was found in, and the places where it was tried, the best
         first: the score and the corners (2, 3) of the part of the scene.
 
     Raises:
-        StageError: as of `register_clouds`.
+        StageError: too few different points, or all in one place or along one line, on either side.
     """
     searched = [(search(obj, scene, settings, seed, ups, scales), scene)]
-    for rows in likely_places(obj, scene, up_in_scene, settings.crop, seed, MAX_PLACES):
+    for rows in [] if marked else likely_places(obj, scene, up_in_scene, settings.crop, seed, MAX_PLACES):
         with contextlib.suppress(StageError):  # too few different points there
             searched.append((search(obj, scene[rows], settings, seed, ups, scales), scene[rows]))
     # The refinement of a pose does not catch up with one that is twice as good.
@@ -262,27 +252,28 @@ def _unless_elsewhere(
     pose, outcome = found.scene_from_object, found.outcome
     if pose is None or outcome is None:
         return found
-    if not found.registered:
+    decision = outcome.decision
+    if not decision.registered:
         shown = outcome.ranked[0].score.precision
-        reason = f"the best place shows {shown:.0%} of the object, which may not be in this scene: {found.reason}"
-        return replace(found, reason=reason)
+        reason = f"the best place shows {shown:.0%} of the object, which may not be in this scene: {decision.reason}"
+        return replace(found, outcome=replace(outcome, decision=replace(decision, reason=reason)))
     middle, size = obj.points.mean(0), pose.scale * obj.diagonal
     elsewhere = [
-        other
+        (other.total, there)
         for other in others
         if other.scene_from_object is not None
-        and np.linalg.norm(other.scene_from_object.apply(middle) - pose.apply(middle)) > DISTINCT_SHIFT * size
+        and np.linalg.norm((there := other.scene_from_object.apply(middle)) - pose.apply(middle))
+        > DISTINCT_SHIFT * size
     ]
-    rival = max(elsewhere, key=lambda other: other.total, default=None)
-    if rival is None or rival.scene_from_object is None:
+    if not elsewhere:
         return found
-    margin = min(outcome.decision.margin, lead(found.total, rival.total))
-    found = replace(found, outcome=replace(outcome, decision=replace(outcome.decision, margin=margin)))
-    if margin >= settings.min_margin:
-        return found
-    at = " ".join(f"{x:.10g}" for x in rival.scene_from_object.apply(middle))
-    reason = f"another place is nearly as good, at ({at}): the margin is {margin:.3f}, below {settings.min_margin:.3f}"
-    return replace(found, registered=False, reason=reason)
+    total, there = max(elsewhere, key=lambda one: one[0])
+    decision = replace(decision, margin=min(decision.margin, lead(found.total, total)))
+    if decision.margin < settings.min_margin:
+        at = " ".join(f"{x:.10g}" for x in there)
+        short = f"the margin is {decision.margin:.3f}, below {settings.min_margin:.3f}"
+        decision = replace(decision, registered=False, reason=f"another place is nearly as good, at ({at}): {short}")
+    return replace(found, outcome=replace(outcome, decision=decision))
 
 
 def _check_points(cloud: Cloud, name: str) -> None:

@@ -28,7 +28,6 @@ from scenefuse.register.register import (
     cut_scene,
     evidence_of,
     find_in_scene,
-    register_clouds,
     report,
     search_box,
     summary,
@@ -118,16 +117,15 @@ def register(
         _check_size(scales, given)
     crs = las_crs(scene)
     unit = "scene units" if crs is None else unit_and_name(crs)[0]
-    places: list[tuple[float, Array]] = []
-    whole = given.scene.part if known.fiducials is None and known.crop_box is None else None
-    if whole is not None:
-        found, part, places = find_in_scene(
-            given.object, whole, settings, seed, ups=given.ups, up_in_scene=known.ups()[1], scales=scales, unit=unit
-        )  # fmt: skip
+    marked = known.fiducials is not None or known.crop_box is not None
+    whole = given.scene.part
+    found, part, places = find_in_scene(
+        given.object, whole, settings, seed,
+        ups=given.ups, up_in_scene=known.ups()[1], scales=scales, unit=unit, marked=marked,
+    )  # fmt: skip
+    if not marked:
         searched = f"{given.searched}, and the parts of it that look like the object"
         given = replace(given, scene=replace(given.scene, part=part), searched=searched)
-    else:
-        found = register_clouds(given.object, given.scene.part, settings, seed, ups=given.ups, scales=scales, unit=unit)
     evidence = evidence_of(given.object, given.scene.part, given.ups)
     points = {"object_points": len(given.object), "scene_points": given.scene.summary.count}
     content = report(found, given.ups) | {
@@ -150,7 +148,7 @@ def register(
     written = _write(out, format, given, found, scene, seed)
     if not found.registered:
         written.append(out / BOX_PAGE)
-        shown = CloudFile.of(scene, most=MAX_SEARCHED_POINTS).part if whole is None else whole
+        shown = CloudFile.of(scene, most=MAX_SEARCHED_POINTS).part if marked else whole
         command = _command(object, scene, out, bool(fuse), known, config)
         write_box_page(written[-1], shown, known.ups()[1], [box for _, box in places], command)
     if fuse:

@@ -30,7 +30,7 @@ from scenefuse.fuse.modes import FusionSettings, around, fuse_by_distance, fuse_
 from scenefuse.fuse.write import Source, together
 from scenefuse.geometry.icp import step_to_planes
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, moved_photos, read_photos
-from scenefuse.metrics.evaluate_object import (
+from scenefuse.metrics.evaluate import (
     ObjectTruth,
     around_object,
     read_object_truth,

@@ -40,7 +40,7 @@ from scenefuse.georef.georeference import adjust_georeferenced, camera_poses, ge
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.georef.residuals import rms
 from scenefuse.marks.clicks import Click
-from scenefuse.metrics.evaluate_scene import within
+from scenefuse.metrics.evaluate import within
 from scenefuse.metrics.truth import HIDDEN, Cameras, cast_together, read_cameras, read_mesh, sample_surface, visible
 from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo, list_photos, read_photos

@@ -23,10 +23,9 @@ from scipy import ndimage
 from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.metrics.evaluate_scene import within
+from scenefuse.metrics.evaluate import within
 from scenefuse.metrics.truth import (
     HIDDEN,
-    belongs_to_object,
     cast_together,
     distances,
     f_score,
@@ -152,7 +151,7 @@ class Truth:
         points = points[((points >= low - margin) & (points <= high + margin)).all(1)]
         rest = cast_together([other for key, other in self.meshes.items() if key != name])
         own = distances(mesh.caster(), points)
-        mine = belongs_to_object(points, own, distances(rest, points), low, high, margin)
+        mine = own < distances(rest, points)
         to_cloud = nearest(sample_surface(mesh, SAMPLES, 0), points[mine])
         result: dict[str, Any] = {}
         for share in (0.5, 1.0, 2.0):

@@ -20,14 +20,15 @@ import torch
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, read_json, run, value
-from scenefuse.metrics.evaluate_object import (
+from scenefuse.metrics.evaluate import (
     COMPARED_PHOTOS,
     ObjectTruth,
+    around_object,
     cloud_results,
     depth_results,
     read_object_truth,
 )
-from scenefuse.metrics.truth import SAMPLES, belongs_to_object, distances
+from scenefuse.metrics.truth import SAMPLES
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.rendered_maps import psnr, refine_depth
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
@@ -152,9 +153,7 @@ def cloud(
     if truth is None:
         return shares
     points = truth.fit.truth_from_model.apply(read_cloud(path).points)
-    low, high = truth.surface.min(0), truth.surface.max(0)
-    to_object, to_rest = (distances(mesh.caster(), points) for mesh in (truth.mesh, truth.rest))
-    near = belongs_to_object(points, to_object, to_rest, low, high, 0.05 * truth.diagonal)
+    near = around_object(points, truth)
     whole = cloud_results(points, truth, len(truth.surface), seed)
     alone = cloud_results(points[near], truth, len(truth.surface), seed) if near.any() else {}
     return shares | {

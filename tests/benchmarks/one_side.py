@@ -23,7 +23,7 @@ from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.settings import ROOT
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
-from scenefuse.metrics.evaluate_object import ObjectTruth, read_object_truth, scene_scores, surface_to_find
+from scenefuse.metrics.evaluate import ObjectTruth, read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.truth import read_cameras
 
 SCENE, SAMPLES = "demo", 60000

@@ -26,7 +26,7 @@ from scenefuse.core.job_records import JobRecords, why_unfinished
 from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
-from scenefuse.metrics.evaluate_object import ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.evaluate import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import SAMPLES, registration_error, true_depth
 from scenefuse.paper.compare_with_paper import (
     COMMON,

@@ -12,7 +12,7 @@ from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.fuse.measure import Evidence
 from scenefuse.fuse.write import Source
-from scenefuse.metrics.evaluate_object import read_object_truth
+from scenefuse.metrics.evaluate import read_object_truth
 from scenefuse.metrics.truth import distances
 
 # Shares of the diagonal beyond which a point is counted.

@@ -14,7 +14,7 @@ import numpy as np
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
-from scenefuse.metrics.evaluate_object import read_object_truth, scene_scores, surface_to_find
+from scenefuse.metrics.evaluate import read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.truth import SAMPLES, Mesh, distances, read_cameras, sample_surface
 from scenefuse.photos.pictures import read_gray, read_rgb
 from scenefuse.surface.make_surface import SurfaceInputs, placed_views, surface_report

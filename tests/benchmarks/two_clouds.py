@@ -18,7 +18,7 @@ from scenefuse.cloud.clouds import read_cloud, write_cloud
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
-from scenefuse.metrics.evaluate_object import read_object_truth, scene_scores, surface_to_find
+from scenefuse.metrics.evaluate import read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.truth import read_cameras, registration_error
 from scenefuse.register.register import Known
 from scenefuse.two_clouds.register import ExitStatus, register

@@ -14,7 +14,7 @@ from scenefuse.core.transforms import Sim3, rotation_angle_deg
 from scenefuse.register.align_models import AlignmentSettings, align_landmarks
 from scenefuse.register.fine import draw_alignment
 from scenefuse.register.landmarks import read_landmarks
-from scenefuse.register.register import RegistrationSettings, register_clouds
+from scenefuse.register.register import RegistrationSettings, find_in_scene
 
 PAIRS = {"south_building": ("walk2", "walk1"), "rock": ("boulder_section", "boulder")}
 UP = np.array([0.0, 0.0, 1.0])
@@ -31,7 +31,7 @@ def two_walks(*, results: Path, pictures: Path) -> None:
     for name, pair in PAIRS.items():
         folders = [results / "scenes" / part for part in pair]
         obj, scene = (read_cloud(folder / "dense.ply") for folder in folders)
-        found = register_clouds(obj, scene, RegistrationSettings(), 0, ups=(UP, UP))
+        found = find_in_scene(obj, scene, RegistrationSettings(), 0, ups=(UP, UP), marked=True)[0]
         ours, theirs = (read_landmarks(folder / "georeferenced", folder / "features.db") for folder in folders)
         alignment = align_landmarks(ours, theirs, AlignmentSettings(), 0)
         print(f"{name}, {len(obj)} points in {len(scene)}")

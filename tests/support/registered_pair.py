@@ -30,7 +30,7 @@ def registered_at_once(monkeypatch, pose: Sim3, registered: bool = True) -> list
         origins = np.zeros(3), np.zeros(3)
         best = Hypothesis(pose, "planted", Score(1.0, 1.0, 1.0, None, None, 0.0))
         outcome = Outcome([best], Decision(registered, "planted", "geometry", 1.0, None, None), None)
-        return Registration(registered, "planted", pose, outcome, origins, ScaleRange(pose.scale, 0.0), {}, unit)
+        return Registration(outcome, origins, ScaleRange(pose.scale, 0.0), {}, unit)
 
     monkeypatch.setattr(register, "search", search)
     monkeypatch.setattr(register, "refined", refined)

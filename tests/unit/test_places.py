@@ -58,9 +58,7 @@ def tried(total, at, registered=True, precision=0.7):
     best = Hypothesis(Sim3(1.0, np.eye(3), np.array(at, float)), "features", score)
     decision = Decision(registered, "its own reason", "geometry", 0.5, None, None)
     origins = np.zeros(3), np.zeros(3)
-    return Registration(
-        registered, decision.reason, best.pose, Outcome([best], decision, None), origins, ScaleRange(1.0, 0.5), {}
-    )
+    return Registration(Outcome([best], decision, None), origins, ScaleRange(1.0, 0.5), {})
 
 
 def chosen(monkeypatch, yard, *there):

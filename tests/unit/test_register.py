@@ -18,7 +18,7 @@ from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.register import Known, RegistrationSettings, register_clouds
+from scenefuse.register.register import Known, RegistrationSettings, find_in_scene
 from scenefuse.two_clouds.register import register
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -122,7 +122,7 @@ def test_two_runs_agree_bit_for_bit_and_origins_far_away_change_nothing(house):
     # Coordinates of few binary digits, so that moving them rounds nothing.
     near = Cloud(np.round(house.scene.points * 2**16) / 2**16, house.scene.normals, house.scene.colors)
     far = Cloud(near.points + UTM, near.normals, near.colors)
-    here, there = (register_clouds(house.object, scene, LITTLE, 0) for scene in (near, far))
+    here, there = (find_in_scene(house.object, scene, LITTLE, 0, marked=True)[0] for scene in (near, far))
     poses = [[h.pose.matrix.tobytes() for h in found.outcome.ranked] for found in (here, there)]
     assert poses[0] == poses[1]
     shift = there.scene_from_object.translation - here.scene_from_object.translation

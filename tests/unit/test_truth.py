@@ -16,14 +16,14 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.core.transforms import Sim3, look_at, rotation_between
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.metrics import truth as tr
-from scenefuse.metrics.evaluate_object import (
+from scenefuse.metrics.evaluate import (
     EvaluationInputs,
     around_object,
     evaluate_object,
+    evaluate_scene,
     read_object_truth,
     scene_scores,
 )
-from scenefuse.metrics.evaluate_scene import evaluate_scene
 from scenefuse.metrics.truth import Cameras, cameras_json, f_score, pinhole, scores_at
 from scenefuse.photos.pictures import read_gray, write_depth
 
@@ -129,7 +129,7 @@ def planted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scene_of(root: Path, out: Path) -> None:
     evaluate_scene(
         model=root / "scene", georeference_json=root / "georeference.json", cloud=root / "before.ply",
-        truth=root / "truth/scene", report=out, seed=0,
+        truth_scene=root / "truth/scene", report=out, seed=0,
         samples=20000,
     )  # fmt: skip
 
@@ -152,7 +152,7 @@ def test_georeferencing_is_measured_with_nothing_fitted(planted: Path, tmp_path:
     model_of(ring(7, 9.0, 9.0), Sim3.identity(), tmp_path / "model")
     evaluate_scene(
         model=tmp_path / "model", georeference_json=tmp_path / "g.json", cloud=planted / "before.ply",
-        truth=planted / "truth/scene", report=tmp_path / "s.json", seed=0,
+        truth_scene=planted / "truth/scene", report=tmp_path / "s.json", seed=0,
         samples=2000,
     )  # fmt: skip
     assert value(read_json(tmp_path / "s.json"), "georeference_error_median") == pytest.approx(2.0, abs=1e-3)
@@ -289,14 +289,6 @@ def test_samples_lie_on_the_mesh_and_spread_by_area() -> None:
     assert np.array_equal(points, tr.sample_surface(mesh, 20000, 0))
 
 
-def test_ground_belongs_to_nobody() -> None:
-    points = np.array([[0, 0, 0.01], [0, 0, 0.9], [9.0, 0, 0]])
-    own = tr.belongs_to_object(
-        points, np.array([0.5, 0.1, 0.1]), np.array([0.01, 0.9, 0.9]), np.zeros(3) - 1, np.ones(3), 0.1
-    )
-    assert own.tolist() == [False, True, False]
-
-
 def test_bad_input_is_named(planted: Path, tmp_path: Path) -> None:
     with pytest.raises(StageError, match="does not exist; render the demo again"):
         tr.read_mesh(tmp_path / "none.ply")
@@ -310,6 +302,6 @@ def test_bad_input_is_named(planted: Path, tmp_path: Path) -> None:
         scene_of_bad = tmp_path
         evaluate_scene(
             model=planted / "scene", georeference_json=planted / "georeference.json", cloud=planted / "before.ply",
-            truth=scene_of_bad, report=tmp_path / "s.json", seed=0,
+            truth_scene=scene_of_bad, report=tmp_path / "s.json", seed=0,
         samples=10,
         )  # fmt: skip

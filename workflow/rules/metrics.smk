@@ -116,7 +116,7 @@ rule evaluate_scene:
         "Scene {wildcards.scene}: comparing with the truth"
     shell:
         "exec python {params.script} --model {input.model} --georeference-json {input.georeference} --cloud {input.cloud}"
-        " --truth {input.truth:q} --report {output} --seed {params.seed} &> {log}"
+        " --truth-scene {input.truth:q} --report {output} --seed {params.seed} &> {log}"
 
 
 rule evaluate_object:

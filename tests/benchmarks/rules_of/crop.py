@@ -28,7 +28,7 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop import crop_cloud, crop_scene
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import CropInputs
-from scenefuse.metrics.evaluate_object import around_object, read_object_truth
+from scenefuse.metrics.evaluate import around_object, read_object_truth
 from scenefuse.photos.workspace import read_views
 
 RESULTS = Path(os.environ.get("RESULTS", "results"))

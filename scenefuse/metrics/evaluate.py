@@ -1,4 +1,5 @@
-"""The evaluation of one object: how far its depth maps, cloud, registration and fusion are from the truth."""
+"""The evaluation of the demo: how far a scene is from the truth, and an object's depth maps, cloud, registration and
+fusion. Only this reads the truth."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,13 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, sampled
-from scenefuse.cloud.tiled_cloud import open_cloud
+from scenefuse.cloud.clouds import Cloud, read_cloud, sampled, sampled_rows
+from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
 from scenefuse.fuse.write import after_fusion
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.metrics import truth
+from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.pictures import read_depth, read_gray
 from scenefuse.photos.workspace import read_cameras, read_views
 from scenefuse.sfm.undistort import undistort_picture
@@ -23,6 +25,106 @@ COMPARED_PHOTOS = 8
 # How far around the object's true box a scene's points count as its own, as a share of its diagonal: farther off than
 # any stray point that a person would take for a part of it.
 MARGIN = 0.05
+
+
+def evaluate_scene(
+    *,
+    model: Path,
+    georeference_json: Path,
+    cloud: Path,
+    truth_scene: Path,
+    report: Path,
+    seed: int,
+    samples: int = truth.SAMPLES,
+) -> None:
+    """Compare a scene of the demo with its truth: cameras, georeferencing, dense cloud.
+
+    The terrain counted for coverage is the surface of terrain and clutter inside the mapped area that at least three
+    photos of the flight see; a sample is covered when the cloud has a point within three ground sampling distances.
+
+    Args:
+        model: georeferenced COLMAP model.
+        georeference_json: its JSON; with an origin in it, the georeferencing itself is measured too.
+        cloud: dense cloud in the model's frame, PLY.
+        truth_scene: the flight's truth folder.
+        report: output JSON; holds `truth_from_scene` (4x4), which the objects' evaluation reads.
+        seed: of the drawing.
+        samples: points drawn from the true surface, and from the cloud for its distances to the truth.
+
+    Raises:
+        StageError: the truth is missing, or knows fewer than three of the model's photos.
+    """
+    cameras = truth.read_cameras(truth_scene / "cameras.json")
+    content = read_json(truth_scene / "cameras.json")
+    meshes = [truth.read_mesh(truth_scene / "meshes" / f"{name}.ply") for name in ["world", *content["objects"]]]
+    posed = truth.read_posed(model, cameras)
+    fit = truth.fit_cameras(posed, cameras)
+    georeference_error = _georeference_error(read_json(georeference_json), content, posed, cameras)
+    result = {
+        **truth.camera_results(fit, len(cameras.names)),
+        "georeference_error_median": quantity(georeference_error, "m"),
+        "georeference_scale_error_pct": quantity(100 * abs(fit.truth_from_model.scale - 1), "%"),
+        **_cloud_results(open_cloud(cloud), fit.truth_from_model, content, meshes, cameras, samples, seed),
+        "truth_from_scene": quantity(fit.truth_from_model.matrix, "m"),
+    }
+    write_json(report, result)
+    truth.print_results(result)
+
+
+def _cloud_results(
+    cloud: TiledCloud,
+    truth_from_cloud: Sim3,
+    content: dict[str, Any],
+    meshes: list[truth.Mesh],
+    cameras: truth.Cameras,
+    samples: int,
+    seed: int,
+) -> dict[str, Any]:
+    """Distance of the cloud from the true surface, and the share of the terrain it covers."""
+    gsd = float(value(content, "ground_sampling_distance"))
+    scene = truth.cast_together(meshes)
+    drawn = sampled_rows(len(cloud), samples, seed)
+    to_truth = truth.distances(scene, truth_from_cloud.apply(cloud.rows(drawn).points))
+    low, high = (np.array(corner) for corner in value(content, "mapped_area"))
+    ground = truth.sample_surface(within(meshes[0], low, high), samples, seed)
+    seen = truth.visible(scene, cameras, ground, truth.HIDDEN)[1].sum(0) >= 3
+    covered = _covered(ground[seen], cloud, truth_from_cloud, 3 * gsd)
+    return {
+        "ground_sampling_distance": quantity(gsd, "m"),
+        "cloud_distance_median": quantity(float(np.median(to_truth)), "m"),
+        "cloud_distance_90": quantity(float(np.quantile(to_truth, 0.9)), "m"),
+        "terrain_covered": quantity(float(covered.mean()), "1"),
+    }
+
+
+def _covered(ground: Array, cloud: TiledCloud, truth_from_cloud: Sim3, reach: float) -> NDArray[np.bool_]:
+    """(M,) which of (M, 3) samples of the ground, in the truth's frame, have a point of the cloud within reach."""
+    found = np.zeros(len(ground), dtype=bool)
+    for _, part in cloud.parts():
+        points = truth_from_cloud.apply(part.points)
+        near = ((ground >= points.min(0) - reach) & (ground <= points.max(0) + reach)).all(1) & ~found
+        found[near] = truth.nearest(ground[near], points) <= reach
+    return found
+
+
+def _georeference_error(
+    report: dict[str, Any], content: dict[str, Any], posed: truth.Posed, cameras: truth.Cameras
+) -> float | None:
+    """Median distance of the georeferenced cameras from the true ones, nothing fitted; None without an origin."""
+    frame = scene_frame(report)
+    if not isinstance(frame, LocalFrame) or value(report, "origin_altitude_m") is None:
+        return None
+    latitude, longitude, altitude = value(content, "origin")
+    true_frame = LocalFrame(latitude, longitude, altitude)
+    expected = frame.apply(true_frame.inverse(cameras.centres[[true for _, true in posed]]))
+    centres = np.array([view.centre for view, _ in posed])
+    return float(np.median(np.linalg.norm(centres - expected, axis=1)))
+
+
+def within(mesh: truth.Mesh, low: Array, high: Array) -> truth.Mesh:
+    """The triangles whose middle lies in a rectangle on the ground."""
+    middles = mesh.vertices[mesh.triangles].mean(1)[:, :2]
+    return truth.Mesh(mesh.vertices, mesh.triangles[((middles >= low) & (middles <= high)).all(1)])
 
 
 @dataclass(frozen=True)
@@ -121,16 +223,17 @@ def cloud_results(points: Array, known: ObjectTruth, samples: int, seed: int) ->
 
 
 def around_object(points: Array, known: ObjectTruth) -> NDArray[np.bool_]:
-    """(N,) points of a scene (N, 3), in the truth's frame, that count as the object's; see `belongs_to_object`.
+    """(N,) points of a scene (N, 3), in the truth's frame, in an object's box and nearer to it than to the rest.
 
-    The box is that of the object's true surface, widened by MARGIN of its diagonal.
+    The box is that of the object's true surface, widened by MARGIN of its diagonal. The ground and clutter around the
+    object thus count neither for nor against a cloud.
     """
     low, high, margin = known.surface.min(0), known.surface.max(0), MARGIN * known.diagonal
     near = ((points >= low - margin) & (points <= high + margin)).all(1)
     inside = np.flatnonzero(near)
     if len(inside):
         own, other = (truth.distances(mesh.caster(), points[inside]) for mesh in (known.mesh, known.rest))
-        near[inside] = truth.belongs_to_object(points[inside], own, other, low, high, margin)
+        near[inside] = own < other
     return near
 
 
