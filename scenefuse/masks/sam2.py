@@ -1,8 +1,9 @@
 """Masks by SAM 2 (Ravi et al. 2024): hiera-tiny run by ONNX Runtime from weights whose hashes are checked, or any
 checkpoint run by transformers, on a GPU where there is one."""
 
+from collections import OrderedDict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,11 +32,26 @@ MIDDLE_POINTS = 4
 MAX_OUTSIDE_DISTANCE_SHARE = 0.3
 
 
-class Sam2(Protocol):
-    """The network, loaded: an encoder of photos and a decoder of prompts."""
+class Sam2:
+    """The network, loaded: an encoder of photos and a decoder of prompts.
+
+    Attributes:
+        kept: photos whose features are kept, the last ones; 17 MB each by ONNX Runtime.
+    """
+
+    def __init__(self) -> None:
+        """Keep one photo's features."""
+        self.kept = 1
+        self._features = OrderedDict[int, tuple[NDArray[np.uint8], Any]]()
 
     def encode(self, image: NDArray[np.uint8]) -> Any:
-        """Features of a (H, W, 3) uint8 RGB photo, for any number of prompts."""
+        """Features of a (H, W, 3) uint8 RGB photo, for any number of prompts; kept ones where it is the same array."""
+        if id(image) not in self._features:
+            # The array is kept, too: another one would get its identity.
+            self._features[id(image)] = image, self._encoded(_blob(image))
+            while len(self._features) > self.kept:
+                self._features.popitem(last=False)
+        return self._features[id(image)][1]
 
     def masks(
         self,
@@ -54,13 +70,26 @@ class Sam2(Protocol):
             box: (2, 2) corners of a box around it, upper left first.
             outside_px: (Q, 2) pixels not on it.
         """
+        logits, quality = self._decoded(features, *_prompts(size, points_px, box, outside_px))
+        return _enlarged(logits, size), quality.astype(np.float64)
+
+    def _encoded(self, blob: NDArray[np.float32]) -> Any:
+        """What the encoder makes of a photo."""
+        raise NotImplementedError
+
+    def _decoded(
+        self, features: Any, points: NDArray[np.float32], labels: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The (3, 256, 256) answers of the decoder and their quality (3,)."""
+        raise NotImplementedError
 
 
-class Sam2Onnx:
+class Sam2Onnx(Sam2):
     """SAM 2 by ONNX Runtime."""
 
     def __init__(self, encoder: Path, decoder: Path, threads: int) -> None:
         """Load both networks onto the CPU (or CUDA, where ONNX Runtime has it)."""
+        super().__init__()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.log_severity_level = 3
@@ -69,26 +98,14 @@ class Sam2Onnx:
         ]
         self._encoder = onnxruntime.InferenceSession(str(encoder), options, providers=providers)
         self._decoder = onnxruntime.InferenceSession(str(decoder), options, providers=providers)
-        self._last: tuple[NDArray[np.uint8], dict[str, NDArray[np.float32]]] | None = None
 
-    def encode(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
-        """See Sam2; 17 MB. The last photo's are kept."""
-        if self._last is None or self._last[0] is not image:
-            names = [o.name for o in self._encoder.get_outputs()]
-            outputs = self._encoder.run(None, {self._encoder.get_inputs()[0].name: _blob(image)})
-            self._last = image, dict(zip(names, outputs))
-        return self._last[1]
+    def _encoded(self, blob: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+        names = [o.name for o in self._encoder.get_outputs()]
+        return dict(zip(names, self._encoder.run(None, {self._encoder.get_inputs()[0].name: blob})))
 
-    def masks(
-        self,
-        features: dict[str, NDArray[np.float32]],
-        size: tuple[int, int],
-        points_px: Array,
-        box: Array | None,
-        outside_px: Array = NO_PIXELS,
-    ) -> tuple[list[Mask], Array]:
-        """See Sam2."""
-        points, labels = _prompts(size, points_px, box, outside_px)
+    def _decoded(
+        self, features: dict[str, NDArray[np.float32]], points: NDArray[np.float32], labels: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         inputs = features | {
             "point_coords": points[None],
             "point_labels": labels[None],
@@ -97,12 +114,10 @@ class Sam2Onnx:
         }
         wanted = {i.name for i in self._decoder.get_inputs()}
         outputs = self._decoder.run(None, {k: v for k, v in inputs.items() if k in wanted})
-        found = next(o for o in outputs if o.ndim == 4)[0]
-        quality = next(o for o in outputs if o.ndim == 2)[0].astype(np.float64)
-        return _enlarged(found, size), quality
+        return next(o for o in outputs if o.ndim == 4)[0], next(o for o in outputs if o.ndim == 2)[0]
 
 
-class Sam2Transformers:
+class Sam2Transformers(Sam2):
     """SAM 2 by transformers, on CUDA where it is."""
 
     def __init__(self, checkpoint: Path) -> None:
@@ -111,6 +126,7 @@ class Sam2Transformers:
         Raises:
             StageError: transformers is not installed, or the folder holds no checkpoint of SAM 2.
         """
+        super().__init__()
         try:
             from transformers import Sam2Model
         except ImportError as error:
@@ -125,33 +141,20 @@ class Sam2Transformers:
             raise StageError(f"{checkpoint} is no folder of a SAM 2 checkpoint for transformers: {reason}") from None
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         self._network = network.to(self._device).eval()
-        self._last: tuple[NDArray[np.uint8], list[torch.Tensor]] | None = None
 
-    def encode(self, image: NDArray[np.uint8]) -> list[torch.Tensor]:
-        """See Sam2. The last photo's are kept."""
-        if self._last is None or self._last[0] is not image:
-            with torch.inference_mode():
-                blob = torch.from_numpy(_blob(image)).to(self._device)
-                self._last = image, self._network.get_image_embeddings(blob)
-        return self._last[1]
+    @torch.inference_mode()
+    def _encoded(self, blob: NDArray[np.float32]) -> list[torch.Tensor]:
+        return self._network.get_image_embeddings(torch.from_numpy(blob).to(self._device))
 
-    def masks(
-        self,
-        features: list[torch.Tensor],
-        size: tuple[int, int],
-        points_px: Array,
-        box: Array | None,
-        outside_px: Array = NO_PIXELS,
-    ) -> tuple[list[Mask], Array]:
-        """See Sam2."""
-        prompts = _prompts(size, points_px, box, outside_px)
-        points, labels = (torch.from_numpy(a)[None, None].to(self._device) for a in prompts)
-        with torch.inference_mode():
-            found = self._network(
-                image_embeddings=features, input_points=points, input_labels=labels.int(), multimask_output=True
-            )
-        quality = found.iou_scores[0, 0].double().cpu().numpy()
-        return _enlarged(found.pred_masks[0, 0].float().cpu().numpy(), size), quality
+    @torch.inference_mode()
+    def _decoded(
+        self, features: list[torch.Tensor], points: NDArray[np.float32], labels: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        at, kind = (torch.from_numpy(a)[None, None].to(self._device) for a in (points, labels))
+        found = self._network(
+            image_embeddings=features, input_points=at, input_labels=kind.int(), multimask_output=True
+        )
+        return found.pred_masks[0, 0].float().cpu().numpy(), found.iou_scores[0, 0].float().cpu().numpy()
 
 
 def _blob(image: NDArray[np.uint8]) -> NDArray[np.float32]:

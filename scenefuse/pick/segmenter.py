@@ -21,30 +21,13 @@ from scenefuse.pick.photo_tiles import MASK_PX, Picture, at_most, read_upright
 
 if TYPE_CHECKING:
     from scenefuse.marks.photo_clicks import PhotoClicks
+    from scenefuse.masks.sam2 import Sam2
 
 Mask = NDArray[np.bool_]
 # Photos whose features are kept; 17 MB each, and the photo.
 KEPT_PHOTOS = 24
 # Without a click for so long, photos that are not shown are prepared.
 IDLE_S = 4.0
-
-
-class _Remembering:
-    """SAM 2 that encodes each photo once."""
-
-    def __init__(self, network: Any) -> None:
-        self._network = network
-        self._features: OrderedDict[int, tuple[Any, Any]] = OrderedDict()
-        self.masks = network.masks
-
-    def encode(self, image: NDArray[np.uint8]) -> Any:
-        """Features of a photo; by its identity, so that it has to be the same array."""
-        if id(image) not in self._features:
-            # The array is kept, too: another one would get its identity.
-            self._features[id(image)] = image, self._network.encode(image)
-            while len(self._features) > KEPT_PHOTOS:
-                self._features.popitem(last=False)
-        return self._features[id(image)][1]
 
 
 class Segmenter:
@@ -65,7 +48,7 @@ class Segmenter:
         """
         self._settings, self._photo_px = settings, photo_px
         self._photos: OrderedDict[str, NDArray[np.uint8]] = OrderedDict()
-        self._network: _Remembering | None = None
+        self._network: Sam2 | None = None
         self._ask: Callable[..., Any] | None = None
         self._busy = threading.Lock()
         self._waiting, self._asked_at = 0, -IDLE_S
@@ -93,8 +76,8 @@ class Segmenter:
                     if checkpoint is None:
                         self._fetch_once(Path(WEIGHTS))
                     network, _ = load_network(Path(ENCODER), Path(DECODER), checkpoint and Path(checkpoint), threads())
-                    self._network = _Remembering(network)
-                    self._ask, self.method = partial(query_sam2, self._network), "SAM 2"
+                    self._network, network.kept = network, KEPT_PHOTOS
+                    self._ask, self.method = partial(query_sam2, network), "SAM 2"
                     return
                 except (StageError, UnavailableError, OSError) as error:
                     self.trouble = f"Masks are shown by GrabCut, not by SAM 2: {error}"
