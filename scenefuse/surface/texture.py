@@ -25,6 +25,8 @@ from scenefuse.surface.mesh import FaceClass, Rows, Surface, cast, caster
 
 # Faces that a textured surface is simplified to: what is finer is in its picture, and to unfold more takes minutes.
 TEXTURED_FACES = 40_000
+# Parts that are unfolded by themselves: eight take a fifth of the time of one, and fill as much of the picture.
+PARTS = 8
 # Longest side of the picture, that all graphics cards take.
 MAX_SIDE_PX = 8192
 
@@ -177,7 +179,7 @@ def _unfolded(points: Array, faces: Rows, side: int) -> Array:
     faces = faces.copy()
     faces[loose] = np.arange(len(points), len(corners)).reshape(-1, 3)
     mesh = o3d.t.geometry.TriangleMesh(tensor(corners.astype(np.float32)), tensor(faces))
-    mesh.compute_uvatlas(size=side, parallel_partitions=threads(), nthreads=threads())
+    mesh.compute_uvatlas(size=side, parallel_partitions=PARTS, nthreads=threads())
     uv = mesh.triangle.texture_uvs.numpy().astype(np.float64)
     return np.stack([uv[..., 0], 1 - uv[..., 1]], axis=-1)
 
