@@ -234,6 +234,95 @@ def _next_reference(point, centres, quality, tried, count):
     return best
 
 
+@njit(error_model="numpy")
+def _axes(normal, right, length):
+    """Vectors (3,) of this length in a patch: along the photo's rows as far as the normal lets them be, and down."""
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    along = right[0] * nx + right[1] * ny + right[2] * nz
+    ax, ay, az = right[0] - along * nx, right[1] - along * ny, right[2] - along * nz
+    scale = length / math.sqrt(ax * ax + ay * ay + az * az)
+    ax, ay, az = ax * scale, ay * scale, az * scale
+    return (ax, ay, az), (ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax)
+
+
+@njit(error_model="numpy")
+def _sort(values, count):
+    """Sort the first few values, the largest first."""
+    for k in range(1, count):
+        value = values[k]
+        while k > 0 and values[k - 1] < value:
+            values[k] = values[k - 1]
+            k -= 1
+        values[k] = value
+
+
+# Sums and sorting of a few numbers are written out: what NumPy has for arrays takes Numba twice as long to compile.
+@njit(error_model="numpy")
+def _match_block(
+    first, last, points, normals, pixels, starts, sizes, projections, centres, rights, focals,
+    curve, spread, tested, confirming, texture, step_length, min_match, slack,
+):  # fmt: skip
+    """`match_points` of the points from `first` to before `last`."""
+    views = len(focals)
+    quality, cosine = np.zeros(views), np.zeros(views)
+    chosen, angles, tried = np.zeros(OTHERS, np.int64), np.zeros(OTHERS), np.zeros(REFERENCES, np.int64)
+    patch, weight = np.zeros(_SAMPLES, np.float32), np.zeros(_SAMPLES, np.float32)
+    samples, ncc = np.zeros((curve.shape[1], _SAMPLES), np.float32), np.zeros((OTHERS, curve.shape[1]))
+    information, few, worth = np.zeros(OTHERS), np.zeros(OTHERS), np.zeros(OTHERS)
+    for i in range(first, last):
+        curve[i], spread[i], tested[i], confirming[i], texture[i], step_length[i] = -1.0, np.inf, 0, 0, 0.0, 0.0
+        point, normal = points[i], normals[i]
+        _photos_of(point, normal, projections, centres, focals, sizes, quality, cosine)
+        for attempt in range(REFERENCES):
+            ref = _next_reference(point, centres, quality, tried, attempt)
+            if ref < 0 or confirming[i] > CONFIRMING_PHOTOS:
+                break
+            tried[attempt] = ref
+            others = _choose(point, ref, centres, quality, chosen, angles, worth)
+            if others < 2:
+                continue
+            footprint = cosine[ref] / quality[ref]
+            across, down = _axes(normal, rights[ref], footprint)
+            mean, variance = _reference_patch(
+                pixels, starts[ref], sizes[ref, 0], sizes[ref, 1], projections[ref], point, across, down, patch,
+                weight,
+            )  # fmt: skip
+            if variance < 0:
+                continue
+            ray_x, ray_y, ray_z = point[0] - centres[ref, 0], point[1] - centres[ref, 1], point[2] - centres[ref, 2]
+            distance = math.sqrt(ray_x * ray_x + ray_y * ray_y + ray_z * ray_z)
+            for k in range(others):
+                few[k] = angles[k]
+            _sort(few, others)
+            step = footprint / math.sin(0.5 * (few[(others - 1) // 2] + few[others // 2]))
+            seen, agreeing, known = 0, 0, 0.0
+            for k in range(others):
+                v = chosen[k]
+                information[k] = _match(
+                    pixels, starts[v], sizes[v, 0], sizes[v, 1], projections[v], centres[ref], point, across, down,
+                    step / distance, patch, weight, mean, variance, samples, ncc[k],
+                )  # fmt: skip
+                seen += ncc[k, OFFSETS] > -1.0
+                if ncc[k, OFFSETS] >= min_match and ncc[k, OFFSETS] >= ncc[k].max() - slack:
+                    agreeing += 1
+                    known += information[k]
+            if seen < 2 or (tested[i] > 0 and agreeing + 1 <= confirming[i]):
+                continue
+            tested[i], texture[i], step_length[i] = seen, math.sqrt(variance), step
+            for j in range(curve.shape[1]):
+                for k in range(others):
+                    few[k] = ncc[k, j]
+                _sort(few, others)
+                best = min(CONFIRMING_PHOTOS, seen)
+                total = 0.0
+                for k in range(best):
+                    total += few[k]
+                curve[i, j] = total / best
+            if agreeing > 0:
+                confirming[i] = agreeing + 1
+                spread[i] = step / math.sqrt(known) if known > 0 else np.inf
+
+
 @njit(parallel=True, cache=True, error_model="numpy")
 def match_points(  # type: ignore[no-untyped-def]
     points, normals, pixels, starts, sizes, projections, centres, rights, focals,
@@ -253,57 +342,10 @@ def match_points(  # type: ignore[no-untyped-def]
     confirm, with the reference; texture (N,) standard deviation of the reference's patch in grey levels; step_length
     (N,) of an offset.
     """
-    count, views = len(points), len(focals)
+    count = len(points)
     together = 64  # points
     for block in prange((count + together - 1) // together):
-        quality, cosine = np.zeros(views), np.zeros(views)
-        chosen, angles, tried = np.zeros(OTHERS, np.int64), np.zeros(OTHERS), np.zeros(REFERENCES, np.int64)
-        patch, weight = np.zeros(_SAMPLES, np.float32), np.zeros(_SAMPLES, np.float32)
-        samples, ncc = np.zeros((curve.shape[1], _SAMPLES), np.float32), np.zeros((OTHERS, curve.shape[1]))
-        information, at_offset, worth = np.zeros(OTHERS), np.zeros(OTHERS), np.zeros(OTHERS)
-        for i in range(block * together, min((block + 1) * together, count)):
-            curve[i], spread[i], tested[i], confirming[i], texture[i], step_length[i] = -1.0, np.inf, 0, 0, 0.0, 0.0
-            point, normal = points[i], normals[i]
-            _photos_of(point, normal, projections, centres, focals, sizes, quality, cosine)
-            for attempt in range(REFERENCES):
-                ref = _next_reference(point, centres, quality, tried, attempt)
-                if ref < 0 or confirming[i] > CONFIRMING_PHOTOS:
-                    break
-                tried[attempt] = ref
-                others = _choose(point, ref, centres, quality, chosen, angles, worth)
-                if others < 2:
-                    continue
-                footprint = cosine[ref] / quality[ref]
-                across = rights[ref] - (rights[ref] * normal).sum() * normal
-                across *= footprint / math.sqrt((across * across).sum())
-                down = np.cross(normal, across)
-                mean, variance = _reference_patch(
-                    pixels, starts[ref], sizes[ref, 0], sizes[ref, 1], projections[ref], point, across, down, patch,
-                    weight,
-                )  # fmt: skip
-                if variance < 0:
-                    continue
-                ray = point - centres[ref]
-                step = footprint / math.sin(np.median(angles[:others]))
-                seen, agreeing, known = 0, 0, 0.0
-                for k in range(others):
-                    v = chosen[k]
-                    information[k] = _match(
-                        pixels, starts[v], sizes[v, 0], sizes[v, 1], projections[v], centres[ref], point, across, down,
-                        step / math.sqrt((ray * ray).sum()), patch, weight, mean, variance, samples, ncc[k],
-                    )  # fmt: skip
-                    seen += ncc[k, OFFSETS] > -1.0
-                    if ncc[k, OFFSETS] >= min_match and ncc[k, OFFSETS] >= ncc[k].max() - slack:
-                        agreeing += 1
-                        known += information[k]
-                if seen < 2 or (tested[i] > 0 and agreeing + 1 <= confirming[i]):
-                    continue
-                tested[i], texture[i], step_length[i] = seen, math.sqrt(variance), step
-                for j in range(curve.shape[1]):
-                    at_offset[:others] = -ncc[:others, j]
-                    at_offset[others:] = 1.0
-                    order = np.sort(at_offset)
-                    curve[i, j] = -order[: min(CONFIRMING_PHOTOS, seen)].mean()
-                if agreeing > 0:
-                    confirming[i] = agreeing + 1
-                    spread[i] = step / math.sqrt(known) if known > 0 else np.inf
+        _match_block(
+            block * together, min((block + 1) * together, count), points, normals, pixels, starts, sizes, projections,
+            centres, rights, focals, curve, spread, tested, confirming, texture, step_length, min_match, slack,
+        )  # fmt: skip

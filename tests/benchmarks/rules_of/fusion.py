@@ -114,6 +114,7 @@ _compiled: list[tuple[float, ...]] = [(photo_kernel.REFERENCES, photo_kernel.GRE
 def _compile(*constants: float) -> None:
     """Compile the kernel again where constants have changed."""
     if constants != _compiled[-1]:
-        for name in ("_suitability", "_choose", "_reference_patch", "_match", "_next_reference", "match_points"):
+        parts = ("_suitability", "_choose", "_reference_patch", "_match", "_next_reference")
+        for name in (*parts, "_match_block", "match_points"):
             getattr(photo_kernel, name).recompile()
         _compiled.append(constants)
