@@ -51,7 +51,8 @@ def _noise(x, y, z, seed):
     return 2 * ((a * (1 - y) + b * y) * (1 - z) + (c * (1 - y) + d * y) * z) - 1
 
 
-@njit(cache=True, fastmath=True)
+# One signature, or Numba would compile it again for each of the constants that it is called with.
+@njit("f8(f8, f8, f8, f8, i8, f8, f8, i8)", cache=True, fastmath=True)
 def fractal_noise(x, y, z, wavelength, octaves, gain, footprint, seed):
     """Octaves of noise from `wavelength` metres down, each half as long; about -1 .. 1."""
     total, norm, weight = 0.0, 0.0, 1.0
