@@ -12,6 +12,10 @@ from scenefuse.core.machine import has_gpu
 
 ROOT = Path(__file__).resolve().parents[1]
 
+# Workers of pytest share the cores: libraries, which read these when they are imported, start no threads beside them.
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+    os.environ.setdefault(name, "1")
+
 # Without a GPU, Triton's interpreter runs the GPU kernels; it reads this when they are imported.
 if not has_gpu():
     os.environ["TRITON_INTERPRET"] = "1"
