@@ -17,6 +17,8 @@ SD_OVER_MEDIAN = 1.4826
 FIXING_POINTS = 3
 # Points lie along a line where they extend across it by less than this share of their extent along it (RMS).
 MIN_BREADTH = 0.01
+# Depths that differ by this share are of two surfaces: no slanted one has such a step.
+DEPTH_JUMP = 0.03
 # What is off by this many standard deviations is an outlier: another place, another pose, or a wrong measurement.
 MAX_DEVIATIONS = 4.0
 

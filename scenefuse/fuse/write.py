@@ -253,16 +253,7 @@ def frame_ledger(pose: Sim3 | None, object_json: Path | None, georeference_json:
         "world_from_file": world_from_object @ file if world_from_object and file else None,
         "scene_from_nerf": pose @ nerf.inverse() if pose and nerf else None,
     }
-    content: dict[str, Any] = {}
-    for name, transform in known.items():
-        content[name] = quantity(None if transform is None else transform.matrix, "")
-        content[f"{name}_inverse_error"] = quantity(None if transform is None else round_trip(transform), "1")
-    return content
-
-
-def round_trip(transform: Sim3) -> float:
-    """Largest entry of T T^-1 - I: how well the inverse undoes the transform."""
-    return float(np.abs(transform.matrix @ transform.inverse().matrix - np.eye(4)).max())
+    return {name: quantity(None if pose is None else pose.matrix, "") for name, pose in known.items()}
 
 
 def _read(path: Path | None, name: str) -> Sim3 | None:

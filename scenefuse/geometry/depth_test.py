@@ -26,8 +26,6 @@ from scenefuse.photos.workspace import View, posed_images, read_model, view_of
 CELL_SPACINGS, SURFACE_SPACINGS = 2.0, 8.0
 # Photos that look along a surface (beyond 75 degrees) show little of it.
 MIN_COSINE = 0.25
-# Depths that differ by this share are of two surfaces: no slanted one has such a step.
-DEPTH_JUMP = 0.03
 # Below this share of points with a measurement on their rays, depth maps tell nothing of an object.
 MIN_MEASURED = 0.1
 

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from scenefuse.core.transforms import DEPTH_JUMP
 from scenefuse.geometry.consistency import back_project
-from scenefuse.geometry.depth_test import DEPTH_JUMP
 from scenefuse.geometry.matcher import Matcher
 from scenefuse.mvs.plane_sweep import DepthMapSettings, refine_by_matching
 from scenefuse.mvs.sparse_depths import pair_worth

@@ -10,8 +10,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import Delaunay, QhullError
 
 from scenefuse.core.stage import StageError
-from scenefuse.core.transforms import Array
-from scenefuse.geometry.depth_test import DEPTH_JUMP
+from scenefuse.core.transforms import DEPTH_JUMP, Array
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import View, Workspace

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, max_pool2d
 
+from scenefuse.core.transforms import DEPTH_JUMP
 from scenefuse.nerf.field import Field
 from scenefuse.nerf.rays import COLOR_DELTA, PhotoTensors, dilate
 from scenefuse.nerf.render import Occupancy, render_view
@@ -19,8 +20,6 @@ from scenefuse.nerf.render import Occupancy, render_view
 SMALL_PX = 96
 # A place is compared in the photos taken nearest to the one it is found in, where both show it.
 COMPARED_PHOTOS = 24
-# Depths that differ by this share are of two surfaces: no slanted one has such a step.
-DEPTH_JUMP = 0.03
 MIN_OPACITY = 0.9
 # Pixels nearer to black are mostly noise, and nearer to white mostly clipped.
 COLOR_MARGIN = 0.03

@@ -19,9 +19,8 @@ from torch import Tensor
 from scenefuse.core.checkpoints import read_state
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, quantity, threads, value, write_json
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import DEPTH_JUMP, Sim3
 from scenefuse.geometry.consistency import compare, extent, normals_from_depth, surface_points
-from scenefuse.geometry.depth_test import DEPTH_JUMP
 from scenefuse.geometry.photo_check import MIN_AGREEING
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.nerf.appearance import MIN_OPACITY, blurred, falloff_map, fitted_log_gain, gains_nearby
@@ -305,8 +304,6 @@ def measure_quality(
                 "ssim": ssim(picture, masked, dilate(mask[None], BEYOND_MASK_PX)[0]),
                 "psnr_right_half": psnr(picture, masked, right),
                 "psnr_right_half_fitted_on_left": psnr(fitted, masked, right),
-                "ssim_right_half": ssim(picture, masked, right),
-                "ssim_right_half_fitted_on_left": ssim(fitted, masked, right),
                 "silhouette_iou": silhouette_iou(rendered[index].opacity, mask),
             }
         )

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from scenefuse.core.stage import quantity, read_json, write_json
-from scenefuse.nerf.appearance import DEPTH_JUMP
+from scenefuse.core.transforms import DEPTH_JUMP
 from scenefuse.nerf.field import Field, FieldSettings, encode
 from scenefuse.nerf.prior_training import LEARNING_RATE, Recipe
 from scenefuse.nerf.rays import DEPTH_DELTA, SOLID_OPACITY, LossWeights, PhotoTensors, dilate

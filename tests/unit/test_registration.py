@@ -12,7 +12,7 @@ from support.planted import errors, plant
 from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
-from scenefuse.fuse.write import frame_ledger, round_trip
+from scenefuse.fuse.write import frame_ledger
 from scenefuse.geometry.depth_test import read_free_space
 from scenefuse.geometry.icp import ScaleRange, refine_planes, refine_points
 from scenefuse.geometry.surface import pair, prepare
@@ -262,13 +262,12 @@ def test_a_line_and_a_point_are_one_sentence(tmp_path, house, size, where):
     assert not scale.exists() and not coarse.exists()
 
 
-def test_frame_ledger_inverts_every_transform(tmp_path):
+def test_frame_ledger_chains_its_transforms(tmp_path):
     pose = Sim3(2.5, Rotation.random(random_state=1).as_matrix(), np.array([4e5, 5e6, 100.0]))
     write_json(tmp_path / "o.json", {"nerf_from_object": quantity(np.diag([0.5, 0.5, 0.5, 1.0]), "")})
     ledger = frame_ledger(pose, tmp_path / "o.json", None)
     assert np.allclose(value(ledger, "scene_from_nerf"), (pose @ Sim3(2.0, np.eye(3), np.zeros(3))).matrix)
     assert value(ledger, "world_from_scene") is None
-    assert round_trip(pose) < 1e-8
     write_json(tmp_path / "o.json", {"nerf_from_object": quantity(np.diag([1.0, 2, 3, 1]), "")})
     with pytest.raises(StageError, match=r"nerf_from_object in .*o\.json is not a similarity.*rerun its stage"):
         frame_ledger(pose, tmp_path / "o.json", None)
