@@ -149,7 +149,7 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float, share: floa
         there = is_same(distance, mine, other[partner], SAME_PLACE_SPACINGS * coarse)
         there &= _beside(first.points, second[partner]) <= fine
         if is_denser:
-            # Of equals the object's points stay in the holes of a denser scene.
+            # Points of the object that are no better stay where a denser scene has holes.
             hole = np.where(mine > BETTER_FACTOR * other[partner], np.inf, SAME_PLACE_SPACINGS * spacing(second.points))
             there &= _beside(first.points, second[partner]) <= hole
         better[obj.surface] = there & (mine > factor * other[partner])

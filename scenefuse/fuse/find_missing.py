@@ -26,7 +26,7 @@ from scenefuse.photos.workspace import View, with_mask
 
 POSITION = ("longitude_deg", "latitude_deg", "altitude_m")
 COLUMNS = ("station", "photo", "x", "y", "z", *POSITION, "above_close_ups", "heading_deg", "pitch_deg", "shows")
-"""Of the table of photos; heading clockwise from north (from y without georeferencing), pitch up from the horizon."""
+"""Columns of the table of photos; heading clockwise from north (from y without georeferencing), pitch above level."""
 
 
 @dataclass(frozen=True)

@@ -172,7 +172,7 @@ def is_placed(registration: dict[str, Any]) -> bool:
 
 
 def uncertainty_on_scene(registration: dict[str, Any]) -> Uncertainty | None:
-    """Of a pose on the scene as it is, by a fine registration's JSON; None where nothing checked the pose."""
+    """How certain a pose is on the scene as it is, by a fine registration's JSON; None where nothing checked it."""
     known = value(registration, "on_scene") if "on_scene" in registration else {}
     covariance = known["covariance"]["value"] if known else None
     return None if covariance is None else Uncertainty.of(np.array(covariance))

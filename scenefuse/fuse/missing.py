@@ -71,7 +71,7 @@ class Missing:
     notes: tuple[str, ...]
 
     def share(self, kind: int) -> float:
-        """Of the object's surface, the share that is missing for this reason."""
+        """Share of the object's surface that is missing for this reason."""
         total = self.covered_cells + len(self.cells)
         return float((self.cells.fields["missing"] == kind).sum()) / max(1, total)
 

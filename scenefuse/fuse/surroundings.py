@@ -91,7 +91,7 @@ def ground_to_add(obj: Cloud, scene: Cloud, added: Cloud, photos: Photos, pictur
 
 
 def missing_ground(obj: Cloud, completed: Cloud, photos: tuple[Photos, Photos]) -> float | None:
-    """Of the ground beside an object that photos of one side show, the share where no point lies; None without any.
+    """Share without points of the ground beside an object that photos of one side show; None where they show none.
 
     Args:
         obj: the object in the scene's frame, z up.

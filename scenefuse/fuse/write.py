@@ -43,7 +43,7 @@ class Source(IntEnum):
 
 @dataclass(frozen=True)
 class Changes:
-    """Of one object, or of several.
+    """What one object, or several, change in a scene's cloud.
 
     Attributes:
         rows: (M,) rising: the points of the scene's cloud that were checked.

@@ -34,7 +34,7 @@ class Where(IntEnum):
     """Where a point lies beside what a depth map shows on its ray."""
 
     OUTSIDE = 0
-    """Of the picture."""
+    """The picture does not show it."""
     UNKNOWN = 1
     IN_FRONT = 2
     AT = 3

@@ -21,7 +21,7 @@ POINT_WEIGHT = 0.1
 COLOR_WEIGHT = 0.3
 # A linearised step changes the scale by this at most (natural logarithm).
 MAX_SCALE_STEP = 0.05
-# Of a model's points that are laid on a cloud, this share counts, those nearest: others are off its surface, or
+# This share of a model's points that are laid on a cloud counts, those nearest: others are off its surface, or
 # mismatched.
 NEAREST_SHARE = 0.7
 # How much the scales of a triple's three edges may differ, least over largest; triples that are tried on all matches;

@@ -28,10 +28,10 @@ MIN_MATCH, MAX_DROP = 0.6, 0.1
 MAX_DEVIATION_PX = 1.2
 # Photos of one side that points are checked in at most.
 MAX_PHOTOS = 64
-# Of how far the best match lies from a point: the point is off by a part of it, the match by the rest. This and the
+# Share of the way from a point to its best match by which the point is off; the match is by the rest. This and the
 # next two by the likelihood of the errors of the demo's house and sculpture, once aligned to the truth.
 PEAK_FACTOR = 0.6
-# Of a step: what is common to a point's matches, interpolation above all, and does not average out.
+# Share of a step that a point's matches are off together, by interpolation above all: it does not average out.
 PIXEL_ERROR = 0.07
 # The noise of a match is so many times what independent pixels would give: photos share the reference, and samples
 # beside each other their pixels.

@@ -60,7 +60,7 @@ def _sample(pixels, start, width, height, x, y):
 
 @njit(error_model="numpy")
 def _cosine(point, first, second):
-    """Of the angle at a point between the rays from two centres; written out, since arrays here would be allocated."""
+    """Cosine of the angle at a point between two centres; written out, since arrays here would be allocated."""
     ax, ay, az = point[0] - first[0], point[1] - first[1], point[2] - first[2]
     bx, by, bz = point[0] - second[0], point[1] - second[1], point[2] - second[2]
     return (ax * bx + ay * by + az * bz) / math.sqrt((ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz))

@@ -42,7 +42,7 @@ def _rows_of(name: str) -> list[dict[str, str]]:
 
 
 _TAU = AgreementSettings().tau_fraction
-# Of each measure what the paper calls it, our definition with its labels in docs/method, and its group in metrics.json.
+# What the paper calls each measure, our definition with its labels in docs/method, and its group in metrics.json.
 MEASURES = {
     row["measure"]: row | {"definition": row["definition"].format(tau=_TAU)} for row in _rows_of("measures.tsv")
 }
@@ -249,7 +249,7 @@ def column_of(item: ObjectSummary) -> Column:
 
 
 def _told(item: ObjectSummary) -> str:
-    """Of a run of the paper's recipe: whose poses it went on with, what it drew of the paper's rays, and its prior."""
+    """What a run of the paper's recipe went on with: whose poses, how many of the paper's rays, which prior."""
     said = {
         "stage1.pose_source": "stages 2 to 4 have the poses of: {}",
         "stage2.rays_per_epoch": "rays an epoch in stages 2 and 4: {}",

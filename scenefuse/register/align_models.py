@@ -192,7 +192,7 @@ def _another(seen: Observations, poses: list[Sim3], seed: int) -> tuple[Sim3 | N
 
 
 def _by_gps(seen: Observations, consensus: Consensus, gps: GpsPose, at: Array, seed: int) -> Consensus:
-    """Of a consensus and its strong rivals the one that GPS does not contradict, if there is just one."""
+    """The one of a consensus and its strong rivals that GPS does not contradict, if there is just one."""
     poses, least = [consensus.pose], MAX_RIVAL_SHARE * consensus.inliers.sum()
     most = 10  # places alike; GPS settles none of more
     other, rival = consensus.other, consensus.rival

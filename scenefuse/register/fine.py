@@ -23,7 +23,7 @@ from scenefuse.register.uncertainty import uncertainty_quantities, with_bending
 
 # Photos whose depth maps give the free space; more look from sides that these have seen.
 FREE_SPACE_PHOTOS = 12
-# Of each of the picture's six views.
+# Side of each of the picture's six views.
 SIDE_PX = 460
 
 

@@ -19,7 +19,7 @@ WINDOW_SIZES = 5
 # Cells along a window: the least that separate an object from a bush beside it. The ground is what a window half as
 # wide again, which no object of that size fills, can be moved along below the surface (Zhang et al. 2003).
 WINDOW_CELLS, OPENING = 8, 1.5
-# Of a landscape with hundreds of trees; a search in one takes a second.
+# Places that are searched at most: a landscape has hundreds of trees, and each takes a second.
 MAX_PLACES = 24
 # A part rises by this share of the window, and by twice that, where it parts from what stands beside it.
 MIN_RISE = 0.15

@@ -35,7 +35,7 @@ class Uncertainty:
 
     @classmethod
     def of(cls, covariance: Array) -> "Uncertainty":
-        """Of a (7, 7) covariance."""
+        """What a (7, 7) covariance says."""
         turn, axes = np.linalg.eigh(covariance[:3, :3])
         return cls(
             float(np.sqrt(max(covariance[6, 6], 0))),

@@ -57,7 +57,7 @@ class Photos:
     with_gps: bool
 
     def megapixels(self, longest_px: float) -> float:
-        """Of all photos, scaled down until their longer side has so many pixels."""
+        """Megapixels of all photos, scaled down until their longer side has so many pixels."""
         return self.count * self.width * self.height * min(1.0, longest_px / max(self.width, self.height)) ** 2 / 1e6
 
     @staticmethod

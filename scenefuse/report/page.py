@@ -25,7 +25,7 @@ from scenefuse.report.view import LEVELS, REMOVED, Shown, View, encode
 from scenefuse.report.view_mesh import ViewMesh, encode_mesh
 from scenefuse.surface.mesh import FaceClass
 
-# Of the scene, then of its objects in turn.
+# Colours of the scene, then of its objects in turn.
 SOURCE_COLORS = ("#c4c9ce", "#f07819", "#2f7fbf", "#3d9a5f", "#a45fb0", "#c9a227", "#4bb3b8", "#d1647f")
 REMOVED_COLOR, UNKNOWN_COLOR = "#b3261e", "#dfe2e5"
 # Colour and label of each number of the field `evidence`.

@@ -18,7 +18,7 @@ from scenefuse.report.values import asset, number, read_table, records
 from scenefuse.report.view import View, read_view, thin
 from scenefuse.report.view_mesh import read_mesh
 
-# Of all 3D views together: about 8 MB. With more views than fit, each gets fewer points.
+# Points of all 3D views together, about 8 MB. With more views than fit, each gets fewer.
 PAGE_POINTS = 700_000
 # What such objects have of figures is from an earlier run.
 UNFINISHED = ("failed", "missing")

@@ -19,7 +19,7 @@ from scenefuse.report.forecast import FORECAST, read_forecast
 from scenefuse.report.run_summary import ObjectSummary, RunInputs, RunSummary, SceneSummary, summarise, why_missing
 from scenefuse.report.values import Fields, asset, find, number, parts_of, records, unit_of
 
-# Of the jobs of a rule: by the clock, of the processor, and as they were forecast.
+# Seconds of a rule's jobs: by the clock, of the processor, and as they were forecast.
 SECONDS = ("seconds", "processor_seconds", "forecast_seconds")
 # What stands beside the value of a completion metric.
 BESIDE = ("null", "before", "after")

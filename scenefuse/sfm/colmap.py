@@ -154,7 +154,7 @@ class Explained:
         return bool((outside >= STRONG_PAIR).any())
 
     def shares(self) -> dict[int, float]:
-        """Of each photo in strong pairs of the model's photos, the share of their matches that the model explains."""
+        """Share of each photo's matches, in strong pairs of the model's photos, that the model explains."""
         strong = (self.matches >= STRONG_PAIR) & self.placed
         shares = {}
         for photo in np.unique(self.pairs[strong]):

@@ -24,7 +24,7 @@ MAX_OFF_CENTRE = 0.1
 # Models by the number of their distortion parameters, the poorer ones as prefixes of the richer.
 POLYNOMIALS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
-# Of these, a second radial term makes a richer one.
+# Models that a second radial term makes richer.
 ONE_TERM = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL")
 
 # The lens is chosen on so many points, and the spread of a model is of so many.

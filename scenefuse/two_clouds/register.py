@@ -51,7 +51,7 @@ OUTPUTS = (
 
 
 class ExitStatus(IntEnum):
-    """Of the command."""
+    """Exit status of the command."""
 
     REGISTERED = 0
     UNREGISTERED = 3
