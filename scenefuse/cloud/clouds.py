@@ -27,7 +27,7 @@ from scenefuse.cloud.readers.columns import (
 )
 from scenefuse.cloud.readers.las import ENDINGS, LAS_DIMENSIONS, WITHHELD
 from scenefuse.cloud.readers.ply import Element, header_of
-from scenefuse.core.stage import StageError, atomic_file
+from scenefuse.core.stage import StageError, atomic_file, threads
 from scenefuse.core.transforms import Sim3
 
 # Share of the spacing of points, from which the steps of their coordinates show.
@@ -140,6 +140,12 @@ def voxels(points: NDArray[np.float64], voxel: float) -> tuple[NDArray[np.int64]
 
 def _group_means(rows: NDArray[Any], group: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.stack([np.bincount(group, rows[:, k]) / counts for k in range(rows.shape[1])], axis=1)
+
+
+def within(points: NDArray[np.float64], others: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+    """(N,) which of (N, D) points have one of (M, D) others within reach."""
+    away = cKDTree(others).query(points, distance_upper_bound=np.nextafter(reach, np.inf), workers=threads())[0]
+    return np.isfinite(away)
 
 
 def spacing(points: NDArray[np.float64], seed: int = 0, quantile: float = 0.5) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, spacing
+from scenefuse.cloud.clouds import Cloud, spacing, within
 from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3
@@ -252,7 +252,7 @@ def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: floa
     is_object = decided & (framed >= least) & (inside >= min_share * shown)
     rows = np.flatnonzero(is_object)
     reach = MAX_BEYOND_POINTS * float(np.linalg.norm(np.ptp(own, axis=0)))
-    is_object[rows] = cKDTree(own).query(in_object[rows], workers=threads())[0] <= reach
+    is_object[rows] = within(in_object[rows], own, reach)
     return Votes(is_object, decided & (inside < 0.5 * shown), scene_from_object.apply(own))
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.cloud_file import NEIGHBOURS
-from scenefuse.cloud.clouds import Cloud, concatenate, spacing
+from scenefuse.cloud.clouds import Cloud, concatenate, spacing, within
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.measure import RESOLUTION, Measured
@@ -96,7 +96,7 @@ def compare(obj: Measured, scene: Measured, disputed: Mask, views: list[View], s
     worse, better = better_measured(obj, scene, diagonal, share)
     reason[worse & (reason == Reason.KEPT)] = Reason.REPLACED
     if len(surface):
-        beside = cKDTree(surface.points).query(scene.cloud.points, workers=threads())[0] <= 2 * RESOLUTION * diagonal
+        beside = within(scene.cloud.points, surface.points, 2 * RESOLUTION * diagonal)
         reason[disputed & beside & (reason == Reason.KEPT)] = Reason.DISPUTED
     added = obj.surface & ~better
     removed = np.flatnonzero(scene.surface & (reason >= Reason.DISPUTED))
@@ -173,7 +173,7 @@ def _times_as_many(points: Array, others: Array, reach: float) -> float:
     """
     if not len(points):
         return 0.0
-    shared = [a[cKDTree(b).query(a, workers=threads())[0] < reach] for a, b in ((points, others), (others, points))]
+    shared = [a[within(a, b, reach)] for a, b in ((points, others), (others, points))]
     return len(np.unique(shared[0], axis=0)) / max(len(shared[1]), 1)
 
 
@@ -233,5 +233,4 @@ def gaps(points: Array, wanted: Mask, added: Mask, scene: Array) -> Mask:
     there = np.concatenate([points[added], scene])
     if len(there) == 0 or not wanted.any():
         return wanted
-    free = cKDTree(there).query(points, workers=threads())[0] > SAME_PLACE_SPACINGS * spacing(points)
-    return wanted & free
+    return wanted & ~within(points, there, SAME_PLACE_SPACINGS * spacing(points))

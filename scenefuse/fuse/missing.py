@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
+from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, within
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import UP, Array, look_at
 from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, THROUGH_SHARE
@@ -92,7 +92,7 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     views = photos[0].views + photos[1].views
     surface = _plain(voxel_downsample(completed, side / 2))
     step = spacing(surface.points, quantile=SPARSEST)
-    apart = cKDTree(surface.points).query(obj.points, workers=threads())[0] > SAME_PLACE_SPACINGS * side
+    apart = ~within(obj.points, surface.points, SAME_PLACE_SPACINGS * side)
     loose = _plain(obj[apart])
     through = see(loose.points, surface, views, step, margin).through >= MIN_AGREEING
     through |= _off_masks(loose.points, masks)
@@ -148,9 +148,8 @@ class _Cells:
 
     def within(self, points: Array, distance: float, chosen: Grid) -> Grid:
         """The chosen cells no farther than that from one of (N, 3) points."""
-        away = cKDTree(points).query(self.middle(chosen), distance_upper_bound=distance, workers=threads())[0]
         found = self.none()
-        found[chosen] = np.isfinite(away)
+        found[chosen] = within(self.middle(chosen), points, distance)
         return found
 
     def middle(self, chosen: Grid) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, sampled_rows, spacing, voxel_downsample
+from scenefuse.cloud.clouds import Cloud, sampled_rows, spacing, voxel_downsample, within
 from scenefuse.cloud.tiled_cloud import Rows
 from scenefuse.core.stage import setting, threads
 from scenefuse.core.transforms import Array, Sim3
@@ -257,7 +257,7 @@ def fuse_by_distance(obj: Cloud, scene: Cloud, part: Cloud, pose: Sim3, settings
     if settings.mode == "fill":
         moved = moved[distance > fill]
     elif settings.mode == "replace":
-        removed = near[cKDTree(moved.points).query(scene.points[near], workers=threads())[0] <= fill]
+        removed = near[within(scene.points[near], moved.points, fill)]
     added = thinned(moved, settings.density * step)
     if settings.mode != "append":
         added = feathered(added, scene[np.setdiff1d(near, removed)], SEAM_SPACINGS * step, fill)

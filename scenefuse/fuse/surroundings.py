@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.cloud_file import NEIGHBOURS
-from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
+from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, within
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import SAME_PLACE_SPACINGS
@@ -81,7 +81,7 @@ def ground_to_add(obj: Cloud, scene: Cloud, added: Cloud, photos: Photos, pictur
     step = max(spacing(added.points), RESOLUTION * obj.diagonal / NEIGHBOURS)
     places = places_on_ground(obj, around, step, apart)
     surface = concatenate([Cloud(one.points, one.normals) for one in (around, added)])
-    places = places[cKDTree(surface.points).query(places.points, workers=threads())[0] > apart]
+    places = places[~within(places.points, surface.points, apart)]
     shown = _shown_in_each(places, surface, photos.views, RESOLUTION * obj.diagonal)
     enough = shown.sum(0) >= CONFIRMING_PHOTOS
     found = measure(places[enough], photos, obj.diagonal)

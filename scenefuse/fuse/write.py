@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, concatenate, records_of, spacing
+from scenefuse.cloud.clouds import Cloud, concatenate, records_of, spacing, within
 from scenefuse.cloud.copc import write_copc
 from scenefuse.cloud.readers.las import LAS_DIMENSIONS
 from scenefuse.cloud.tiled_cloud import BOX, ROW_OF_TILE, Rows, TiledCloud, open_cloud, reserved
@@ -378,7 +378,7 @@ def _apart(cloud: Cloud, before: list[Cloud]) -> Cloud:
     there = np.concatenate([one.points[((one.points >= low) & (one.points <= high)).all(1)] for one in before])
     if not len(there):
         return cloud
-    return cloud[cKDTree(there).query(cloud.points, workers=threads())[0] > step]
+    return cloud[~within(cloud.points, there, step)]
 
 
 def _report(

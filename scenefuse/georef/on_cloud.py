@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.cloud_file import CloudFile
-from scenefuse.cloud.clouds import spacing
+from scenefuse.cloud.clouds import spacing, within
 from scenefuse.cloud.crs import check_place, grid_name, to_wgs84, usable
 from scenefuse.cloud.formats import readable
 from scenefuse.cloud.import_cloud import crs_of
@@ -268,4 +268,4 @@ def _met(points: Array, own: Array, centres: Array) -> float:
     if len(own) < MIN_OVER:
         return 0.0
     reach = np.maximum(MAX_MET_SHARE * cKDTree(centres).query(own)[0], spacing(points))
-    return float((cKDTree(points).query(own, workers=threads())[0] <= reach).mean())
+    return float(within(own, points, reach).mean())

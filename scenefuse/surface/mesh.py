@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample
+from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample, within
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import MARGIN, MIN_AGREEING, SAME_PLACE_SPACINGS
@@ -201,7 +201,7 @@ def _bridges(
     half, middle = MAX_GAP / 2 * cloud.diagonal, points[faces[far]].mean(1)
     wide = distance[far] > half
     if wide.any():
-        wide |= cKDTree(middle[wide]).query(middle, workers=threads())[0] <= half
+        wide |= within(middle, middle[wide], half)
     linked = place[pairs[(place[pairs] >= 0).all(1)]]
     linked = linked[wide[linked[:, 0]] == wide[linked[:, 1]]]
     graph = coo_matrix((np.ones(len(linked)), linked.T), shape=(len(far), len(far)))
