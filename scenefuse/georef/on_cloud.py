@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.cloud_file import CloudFile
-from scenefuse.cloud.clouds import spacing, within
+from scenefuse.cloud.clouds import spacing
 from scenefuse.cloud.crs import check_place, grid_name, to_wgs84, usable
 from scenefuse.cloud.formats import readable
 from scenefuse.cloud.import_cloud import crs_of
@@ -35,9 +35,8 @@ MAX_COMPARED = 200_000
 # is met by a smaller share of the points that the photos' own matches give in its box than the second. Of four right
 # clouds 66 % were met or more; with mirrored or swapped axes, half a turn, or 5 % larger, 17 % or fewer.
 MIN_SEEN, MIN_MET = 0.1, 0.2
-# More than the first share of a right cloud as dense as the photos allow is met. Where so much more is met once it is
-# moved, it is off, and where that moves it by more of the cameras' distance, turns it by more degrees, or scales it by
-# more per cent.
+# Of a right cloud as dense as the photos allow more is met. Where so much more is met once it is moved, it is off, and
+# where that moves it by more of the cameras' distance, turns it by more degrees, or scales it by more per cent.
 USUAL_MET, MIN_BETTER_MET, MAX_OFF = 0.6, 0.15, (0.01, 1.0, 1.0)
 # What is met by the cloud: within this share of the distance to the nearest camera, or within a spacing of the cloud.
 MAX_MET_SHARE = 0.002
@@ -268,4 +267,4 @@ def _met(points: Array, own: Array, centres: Array) -> float:
     if len(own) < MIN_OVER:
         return 0.0
     reach = np.maximum(MAX_MET_SHARE * cKDTree(centres).query(own)[0], spacing(points))
-    return float(within(own, points, reach).mean())
+    return float((cKDTree(points).query(own, workers=threads())[0] <= reach).mean())
