@@ -35,8 +35,9 @@ MAX_COMPARED = 200_000
 # is met by a smaller share of the points that the photos' own matches give in its box than the second. Of four right
 # clouds 66 % were met or more; with mirrored or swapped axes, half a turn, or 5 % larger, 17 % or fewer.
 MIN_SEEN, MIN_MET = 0.1, 0.2
-# Of a right cloud as dense as the photos allow more is met. Where so much more is met once it is moved, it is off, and
-# where that moves it by more of the cameras' distance, turns it by more degrees, or scales it by more per cent.
+# More than the first share of a right cloud as dense as the photos allow is met. Where so much more is met once it is
+# moved, it is off, and where that moves it by more of the cameras' distance, turns it by more degrees, or scales it by
+# more per cent.
 USUAL_MET, MIN_BETTER_MET, MAX_OFF = 0.6, 0.15, (0.01, 1.0, 1.0)
 # What is met by the cloud: within this share of the distance to the nearest camera, or within a spacing of the cloud.
 MAX_MET_SHARE = 0.002
