@@ -4,6 +4,7 @@ import argparse
 import inspect
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -31,6 +32,8 @@ def main() -> None:
     parser.add_argument("part", choices=PARTS, help="what to do; scenefuse PART --help says more", metavar="PART")
     part = parser.parse_args(sys.argv[1:2]).part
     sys.argv = [f"scenefuse {part}", *sys.argv[2:]]
+    # Ctrl-C ends imports without a traceback; what runs then handles it.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
         PARTS[part]()
     except ModuleNotFoundError as error:
@@ -112,8 +115,8 @@ def _export() -> None:
     finished = sorted(path.parent.name for path in Path().glob("results/objects/*/fused.ply"))
     missing = [name for name in words.names or () if name not in finished]
     if missing or not finished:
-        which = f"object '{missing[0]}' has" if missing else "no object has"
-        sys.exit(f"error: {which} a results/objects/NAME/fused.ply here; run the workflow first (scenefuse run)")
+        which = f"results/objects/{missing[0]}/fused.ply is not" if missing else "no results/objects/NAME/fused.ply is"
+        sys.exit(f"error: {which} here ({Path.cwd()}); run the workflow first (scenefuse run)")
     names = sorted(words.names or finished)
     if words.facade:
         if len(names) > 1:

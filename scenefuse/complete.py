@@ -1,6 +1,7 @@
 """`scenefuse complete`: from folders of photos to the completed scene; the same command again goes on."""
 
 import contextlib
+import fcntl
 import os
 import re
 import signal
@@ -176,7 +177,12 @@ def _run_workflow(project: Path, targets: list[str], cores: int | None) -> None:
     log.parent.mkdir(parents=True, exist_ok=True)
     print(f"Running on {cores} {'core' if cores == 1 else 'cores'}; all that Snakemake says: {log}", flush=True)
     started = time.time()
-    with open(log, "w") as written, open(log, errors="replace") as read:
+    with open(log, "a") as written, open(log, errors="replace") as read:
+        try:
+            fcntl.flock(written, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise StageError(f"another run works in {project}; wait until it ends, or stop it") from None
+        written.truncate(0)
         # In a session of its own, so that Ctrl-C reaches it once, from here.
         process = subprocess.Popen(
             command, cwd=project, env=_environment(), stdout=written, stderr=subprocess.STDOUT, start_new_session=True

@@ -194,14 +194,19 @@ def _of_cameras(found: Georeference, left: Residuals) -> dict[str, Any]:
     distance = np.sqrt(np.nansum(left.cameras**2, axis=1))
     whole = rms(left.cameras[inliers])
     print(f"GPS residuals: median {np.median(distance):.2f} m, RMS of inliers {whole or 0:.2f} m", flush=True)
+    horizontal = rms(left.cameras[inliers, :2])
     content = {
         "gps_residual_median_m": quantity(float(np.median(distance)), "m"),
         "gps_residual_rms_m": quantity(whole, "m"),
-        "gps_residual_horizontal_rms_m": quantity(rms(left.cameras[inliers, :2]), "m"),
+        "gps_residual_horizontal_rms_m": quantity(horizontal, "m"),
         "gps_residual_vertical_rms_m": quantity(rms(left.cameras[inliers, 2:]), "m"),
         "gps_outliers": quantity([name for name, ok in zip(gps.names, inliers) if not ok], ""),
         "gps_accuracy_m": quantity(np.median(gps.sd_m, axis=0), "m"),
     }
+    if found.frame is not None and horizontal:
+        # Of a similarity fitted to N positions, each coordinate off by its share of the residual.
+        at = found.frame.apply(gps.positions[inliers])[:, :2]
+        content["gps_scale_sd_log"] = quantity(horizontal / np.sqrt(2 * ((at - at.mean(0)) ** 2).sum()), "1")
     if found.control is not None:
         content["gps_shift"] = quantity(found.placement.gps_shift, "m")
     return content

@@ -101,7 +101,7 @@ def _accuracy(has: dict[str, Any], unit: str) -> dict[str, str]:
     ]
     found = [f"standard deviation of a point {' and '.join(parts)}"] if parts else []
     if has.get("scale_sd_log"):
-        found.append(f"its scale in the scene is known to {percent(has['scale_sd_log'])}")
+        found.append(f"its size beside the scene's is known to {percent(has['scale_sd_log'])}")
     return {"Accuracy": "; ".join(found)} if found else {}
 
 
@@ -152,6 +152,8 @@ def scene_facts(row: Row) -> dict[str, str]:
     ]
     if errors:
         facts["Residuals"] = "; ".join(errors)
+    if "gps_scale_sd_log" in has and "control_rms_horizontal_m" not in has:
+        facts["Lengths"] = f"known to {percent(has['gps_scale_sd_log'])} by the photos' GPS"
     if "completed_points" in has:
         file = f"results/scenes/{has['scene']}/completed"
         facts["File"] = f"{file}.copc.laz" + (

@@ -1,5 +1,6 @@
 """`scenefuse complete` and `run`: what they make, start and say; Snakemake is a stand-in here."""
 
+import fcntl
 import os
 import sys
 from pathlib import Path
@@ -77,6 +78,20 @@ def test_the_same_command_goes_on_and_other_folders_are_another_project(two_fold
     Project(two_folders).photos("shed")
     with pytest.raises(StageError, match=r"flight_completed holds another project \(objects: close\); delete it, give"):
         run("close", "shed")
+
+
+def test_a_second_run_in_the_same_project_is_refused_and_leaves_the_first_ones_log(two_folders, workflow):
+    workflow(SUMMARY)
+    run("close", prompts=(Path("clicks.tsv"),))
+    log = Path("flight_completed/results/logs/run.log")
+    log.write_text("of the first\n")
+    workflow("")
+    with open(log, "a") as first:
+        fcntl.flock(first, fcntl.LOCK_EX)
+        with pytest.raises(StageError, match="another run works in flight_completed; wait until it ends, or stop it"):
+            run("close")
+    assert log.read_text() == "of the first\n"
+    run("close")
 
 
 def test_without_a_screen_an_object_without_clicks_is_one_sentence(two_folders, monkeypatch):

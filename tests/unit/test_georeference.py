@@ -282,6 +282,16 @@ def test_stage_brings_a_model_into_metres(model):
     np.testing.assert_allclose(crs_from_scene.translation, value(report, "origin_in_crs"))
 
 
+def test_lengths_are_known_as_well_as_noisy_positions_fix_the_scale(model):
+    folder, names, truth = model
+    exact = value(georegister_in(folder, listed(names, truth))[0], "scale")
+    rng, ratios = np.random.default_rng(0), []
+    for _ in range(12):
+        report, _ = georegister_in(folder, listed(names, truth + rng.normal(0, 0.5, truth.shape)))
+        ratios.append(np.log(value(report, "scale") / exact) / value(report, "gps_scale_sd_log"))
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 2
+
+
 def test_results_are_in_the_crs_that_the_table_names(model):
     folder, names, truth = model
     report, _ = georegister_in(folder, listed(names, truth), "EPSG:2056")

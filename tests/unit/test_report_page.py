@@ -339,7 +339,7 @@ QUESTIONS = {
     "which CRS?": r"UTM zone 32N \(EPSG:25832\)",
     "when?": "2024-06-01",
     "how many photos?": "40 of 40 used",
-    "may I trust the scale?": r"its scale in the scene is known to 0\.1 %",
+    "may I trust the scale?": r"its size beside the scene's is known to 0\.1 %",
     "where is the file?": r"objects/house/fused\.ply",
     "what next?": r"photograph it from 4 places \(results/objects/house/next_photos\.csv\)",
     "who made it?": r"Made by scenefuse \d",

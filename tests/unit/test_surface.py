@@ -440,7 +440,7 @@ def test_tiles_hold_every_point_once_and_lie_where_the_scene_lies(closed, tmp_pa
 def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["scenefuse", "export"])
-    with pytest.raises(SystemExit, match="no object has a results/objects/NAME/fused.ply here; run the workflow first"):
+    with pytest.raises(SystemExit, match=r"no results/objects/NAME/fused.ply is here \(.*\); run the workflow first"):
         command_line.main()
     for name in ("objects/shed/fused.ply", "objects/barn/fused.ply", "scenes/yard/dense.ply", "summary/report.html"):
         (tmp_path / "results" / name).parent.mkdir(parents=True)
