@@ -89,7 +89,10 @@ def surface_facts(folder: Path) -> dict[str, str]:
     shares = ", ".join(
         f"{percent(value(found, kind))} {kind}" for kind in ("measured", "unconfirmed", "bridged", "open")
     )
-    drawings = f", results/objects/{folder.name}/drawings/drawings.pdf" if (folder / "drawings").is_dir() else ""
+    pdf = folder / "drawings/drawings.pdf"
+    # Those of an earlier surface say nothing of this one.
+    current = pdf.is_file() and pdf.stat().st_mtime >= (folder / "surface.json").stat().st_mtime
+    drawings = f", results/objects/{folder.name}/drawings/drawings.pdf" if current else ""
     return {"Mesh": f"With the ground around it {shares}; results/objects/{folder.name}/surface.glb{drawings}"}
 
 

@@ -482,6 +482,12 @@ def test_the_report_says_of_a_surface_how_much_is_measured(closed, tmp_path: Pat
     write_json(tmp_path / "surface.json", surface_report(closed, "m") | {"reason": quantity("", "")})
     found = surface_facts(tmp_path)["Mesh"]
     assert "% measured" in found and "% open" in found and found.endswith(f"objects/{tmp_path.name}/surface.glb")
+    pdf, made = tmp_path / "drawings/drawings.pdf", (tmp_path / "surface.json").stat().st_mtime
+    pdf.parent.mkdir()
+    pdf.touch()
+    for age, listed in ((10, False), (-10, True)):
+        os.utime(pdf, (made - age, made - age))
+        assert ("drawings.pdf" in surface_facts(tmp_path)["Mesh"]) == listed
 
 
 def test_an_object_has_two_pages_on_paper_with_its_sides_to_one_scale(coarse, tmp_path: Path):
