@@ -134,7 +134,7 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float, share: floa
         common = np.hypot(one, np.where(np.isfinite(two), two, typical))
         return np.asarray(distance <= np.clip(SAME_PLACE_DEVIATIONS * common, least, 2 * RESOLUTION * diagonal))
 
-    distance, partner = cKDTree(first.points).query(points, workers=threads())
+    distance, partner = _nearest(points, first.points, 2 * RESOLUTION * diagonal)
     # A measured point of the scene is on the object's surface or beside it, on the ground for instance.
     least = SAME_PLACE_SPACINGS * np.where(scene.surface, fine, coarse)
     worse = is_same(distance, mine[partner], theirs, least) & (mine[partner] <= factor * theirs)
@@ -144,7 +144,7 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float, share: floa
         # What it did not measure may well be right where the object measures less exactly than the scene.
         inexact = (mine[partner] > BETTER_FACTOR * typical) & (distance <= SAME_PLACE_DEVIATIONS * mine[partner])
         worse &= scene.surface | ~inexact
-        distance, partner = cKDTree(second.points).query(first.points, workers=threads())
+        distance, partner = _nearest(first.points, second.points, 2 * RESOLUTION * diagonal)
         # A better point of a sparser side stands for what lies within a spacing of the object's.
         there = is_same(distance, mine, other[partner], SAME_PLACE_SPACINGS * coarse)
         there &= _beside(first.points, second[partner]) <= fine
@@ -154,6 +154,12 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float, share: floa
             there &= _beside(first.points, second[partner]) <= hole
         better[obj.surface] = there & (mine > factor * other[partner])
     return worse, better
+
+
+def _nearest(points: Array, others: Array, reach: float) -> tuple[Array, NDArray[np.intp]]:
+    """Distance (N,) to the nearest of the others (M, 3) and its row (N,); infinite, and any row, beyond reach."""
+    distance, row = cKDTree(others).query(points, distance_upper_bound=reach, workers=threads())
+    return distance, np.minimum(row, len(others) - 1)
 
 
 def _alone(points: Array, others: Cloud, reach: float) -> Mask:
