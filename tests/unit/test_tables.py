@@ -127,7 +127,7 @@ def test_a_folder_whose_name_begins_like_an_option_stays_a_folder(project):
 def test_as_shipped_only_the_registration_that_is_fused_runs_and_the_demo_adds_what_it_is_compared_with(project):
     assert set(project().variants) == {"full"}
     demo = yaml.safe_load((ROOT / "config/demo.yaml").read_text())
-    assert set(project(**demo).variants) == {"full", "paper", "clouds_only", "no_scale", "no_crop"}
+    assert set(project(**demo).variants) == {"full", "paper", "clouds_only"}
 
 
 def test_variants_are_the_settings_of_registration_with_what_differs(project):
