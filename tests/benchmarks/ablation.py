@@ -1,6 +1,7 @@
 """The paper's Table 4 on the demo: every registration variant over several seeds, at the full variant's thresholds.
 
-snakemake --configfile config/demo.yaml --config 'registration={variants: [full, paper, clouds_only, no_scale, no_crop]}' --cores 2
+snakemake --configfile config/demo.yaml --cores 2 \\
+    --config 'registration={variants: [full, paper, clouds_only, no_scale, no_crop]}'
 PYTHONPATH=. python tests/benchmarks/ablation.py --results results --seeds 3
 """
 
