@@ -73,15 +73,14 @@ def object_facts(row: Row) -> dict[str, str]:
     return _capital(facts | _next(has))
 
 
-def has_surface(folder: Path) -> bool:
-    """Whether an object's results hold a surface of its last fusion."""
-    surface, fused = folder / "surface.json", folder / "fused.ply"
-    return surface.is_file() and fused.is_file() and surface.stat().st_mtime >= fused.stat().st_mtime
+def is_current(made: Path, source: Path) -> bool:
+    """Whether two files are there, and the first, which is made of the second, is not of an earlier one."""
+    return made.is_file() and source.is_file() and made.stat().st_mtime >= source.stat().st_mtime
 
 
 def surface_facts(folder: Path) -> dict[str, str]:
     """The same of the surface in an object's results; nothing where none was made of its last fusion."""
-    if not has_surface(folder):
+    if not is_current(folder / "surface.json", folder / "fused.ply"):
         return {}
     found = read_json(folder / "surface.json")
     if value(found, "status") == "empty":
@@ -89,10 +88,8 @@ def surface_facts(folder: Path) -> dict[str, str]:
     shares = ", ".join(
         f"{percent(value(found, kind))} {kind}" for kind in ("measured", "unconfirmed", "bridged", "open")
     )
-    pdf = folder / "drawings/drawings.pdf"
-    # Those of an earlier surface say nothing of this one.
-    current = pdf.is_file() and pdf.stat().st_mtime >= (folder / "surface.json").stat().st_mtime
-    drawings = f", results/objects/{folder.name}/drawings/drawings.pdf" if current else ""
+    drawn = is_current(folder / "drawings/drawings.pdf", folder / "surface.json")
+    drawings = f", results/objects/{folder.name}/drawings/drawings.pdf" if drawn else ""
     return {"Mesh": f"With the ground around it {shares}; results/objects/{folder.name}/surface.glb{drawings}"}
 
 

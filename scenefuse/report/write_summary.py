@@ -3,6 +3,7 @@ object with what the stages measured, chose and noted, then time and memory."""
 
 import math
 import re
+import shutil
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ import yaml
 from scenefuse.core.stage import atomic_file
 from scenefuse.core.version import VERSION
 from scenefuse.metrics.completion import MEASURES
-from scenefuse.report.facts import diagnose, ground_pixel, object_facts, photographed, scene_facts
+from scenefuse.report.facts import diagnose, ground_pixel, is_current, object_facts, photographed, scene_facts
 from scenefuse.report.forecast import FORECAST, read_forecast
 from scenefuse.report.run_summary import ObjectSummary, RunInputs, RunSummary, SceneSummary, summarise, why_missing
 from scenefuse.report.values import Fields, asset, find, number, parts_of, records, unit_of
@@ -46,7 +47,7 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
 
     Args:
         run: see RunInputs.
-        summary: output folder; other files in it are left alone.
+        summary: output folder; of other files in it, report.pdf goes, and drawings of an earlier fusion with it.
     """
     found = summarise(run)
     tables = {
@@ -65,6 +66,11 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
         with atomic_file(summary / f"{name}.txt") as temporary:
             temporary.write_text(text)
     print(texts["summary"], flush=True)
+    # What was exported of earlier results may not be handed over as of these.
+    (summary / "report.pdf").unlink(missing_ok=True)
+    for folder in run.objects:
+        if not is_current(folder / "drawings/drawings.pdf", folder / "fused.ply"):
+            shutil.rmtree(folder / "drawings", ignore_errors=True)
 
 
 def registration_table(run: RunSummary) -> pd.DataFrame:

@@ -293,6 +293,18 @@ def test_an_empty_run_is_a_summary_too(tmp_path):
     assert len((tmp_path / "summary/completion.tsv").read_text().splitlines()) == 1
 
 
+def test_a_summary_removes_what_was_exported_of_earlier_results(results):
+    exported = [results / "objects" / name / "drawings/drawings.pdf" for name in ("house", "balloon")]
+    for path in (*exported, results / "summary/report.pdf"):
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+        fused = path.parents[1] / "fused.ply"
+        fused.touch()
+        os.utime(path, (fused.stat().st_mtime + 60 * (-1) ** ("house" in path.parts),) * 2)
+    assert not (summarise(results) / "report.pdf").exists()
+    assert [path.exists() for path in exported] == [False, True]
+
+
 def test_the_last_error_is_that_of_the_named_object(tmp_path):
     jobs = JobRecords(tmp_path, tmp_path / "benchmarks")
     (tmp_path / "fine").mkdir()
