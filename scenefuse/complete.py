@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import webbrowser
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -67,10 +67,13 @@ def complete(
         StageError: a folder is not what it should be, an object has no clicks, or the run failed.
     """
     objects, shows = (house, *others), has_screen() and not no_browser
-    project = out or Path(f"{default_name(flight)}_completed")
+    project, files = out or Path(f"{default_name(flight)}_completed"), {"prompts": prompts, "masks": masks}
+    _check_options(files, len(objects), cores)
     _make_or_go_on(project, flight, objects, preset)
-    for column, given in (("prompts", prompts), ("masks", masks)):
-        _name_files(project, column, given, objects)
+    for column, given in files.items():
+        if given:
+            cells = {default_name(o): cell_of(path, project) for o, path in zip(objects, given)}
+            fill(project / OBJECTS, column, cells)
     for name in _without_clicks(project, cores):
         _click(project, name, shows)
     _run_workflow(project, [], cores)
@@ -80,7 +83,7 @@ def complete(
 
 
 def _make_or_go_on(project: Path, flight: Path, objects: Sequence[Path], preset: Preset) -> None:
-    """Make the project, where it is not there yet.
+    """Make the project, where it is not there yet; objects beside all that it has are added.
 
     Raises:
         StageError: the folder holds another project.
@@ -91,25 +94,31 @@ def _make_or_go_on(project: Path, flight: Path, objects: Sequence[Path], preset:
     for table, rows in project_rows(project, flight, objects).items():
         kind = table.stem.removesuffix("s")
         there = read_table(project / table, kind)
-        for row in rows:
-            held = there.get(row[kind], {})
-            if any(held.get(key) != row[key] for key in row if key != "prompts"):
-                raise StageError(
-                    f"{project} holds another project ({kind}s: {', '.join(there)}); delete it, give another folder by"
-                    f" --out, or add {row[kind]} to {project / table} and use scenefuse run there"
-                )
+        new = [row for row in rows if row[kind] not in there]
+        known = [(row, there[row[kind]]) for row in rows if row[kind] in there]
+        differs = any(held.get(key) != row[key] for row, held in known for key in row if key != "prompts")
+        if differs or (new and (kind == "scene" or len(known) < len(there))):
+            raise StageError(
+                f"{project} holds another project ({kind}s: {', '.join(there)}); delete it, or give another folder by"
+                " --out"
+            )
+        for added in new:
+            for column, cell in added.items():
+                fill(project / table, column, {added[kind]: cell})
     print(f"Going on with {project}", flush=True)
 
 
-def _name_files(project: Path, column: str, given: Sequence[Path], objects: Sequence[Path]) -> None:
-    """Name files or folders, one for each object, in a column of the objects' table."""
-    if given and len(given) != len(objects):
-        raise StageError(f"--{column} names {len(given)} for {len(objects)} objects; give one for each, in their order")
-    missing = next((path for path in given if not path.exists()), None)
-    if missing is not None:
-        raise StageError(f"{missing} does not exist; correct --{column}")
-    if given:
-        fill(project / OBJECTS, column, {default_name(o): cell_of(path, project) for o, path in zip(objects, given)})
+def _check_options(files: Mapping[str, Sequence[Path]], objects: int, cores: int | None) -> None:
+    """StageError where an option cannot be used: before anything is made, so that a corrected command starts anew."""
+    for column, given in files.items():
+        if given and len(given) != objects:
+            raise StageError(f"--{column} names {len(given)} for {objects} objects; give one for each, in their order")
+        missing = next((path for path in given if not path.exists()), None)
+        if missing is not None:
+            raise StageError(f"{missing} does not exist; correct --{column}")
+    most = os.cpu_count() or 1
+    if cores is not None and not 1 <= cores <= most:
+        raise StageError(f"--cores {cores} cannot be had; give 1 to {most}, or leave it out for all")
 
 
 def _without_clicks(project: Path, cores: int | None) -> list[str]:

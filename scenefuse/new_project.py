@@ -9,12 +9,13 @@ from typing import Literal
 
 import tyro
 
-from scenefuse.cloud.formats import READERS
+from scenefuse.cloud.formats import READERS, columns_in_parts
+from scenefuse.cloud.readers.text import TEXTS
 from scenefuse.core.settings import OWN_SETTINGS, PACKAGE, ROOT, schema_of
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.tables import Row, read_table
 from scenefuse.core.transforms import FIXING_POINTS
-from scenefuse.photos.photo_files import VIDEO_SUFFIXES, in_folders, photo_files
+from scenefuse.photos.photo_files import SUFFIXES, VIDEO_SUFFIXES, in_folders, photo_files
 
 SCENES, OBJECTS = Path("config/scenes.tsv"), Path("config/objects.tsv")
 COLUMNS = {
@@ -48,10 +49,8 @@ def init(
     """
     rows = make_project(folder, scene, objects, preset)
     clicks = (f"scenefuse pick --object {row['object']}" for row in rows[OBJECTS] if "photos" in row)
-    print(
-        f"next: cd {shlex.quote(str(folder))} && {next(clicks, 'scenefuse run')}    (README.md there says more)",
-        flush=True,
-    )
+    step = f" && {next(clicks, 'scenefuse run')}" if any(rows.values()) else ", and fill in both tables in config/"
+    print(f"next: cd {shlex.quote(str(folder))}{step}    (README.md there says more)", flush=True)
 
 
 def make_project(folder: Path, scene: Path | None, objects: Sequence[Path], preset: str) -> dict[Path, list[Row]]:
@@ -69,6 +68,8 @@ def make_project(folder: Path, scene: Path | None, objects: Sequence[Path], pres
     for path in (folder / name for name in texts):
         if path.exists() or (folder.exists() and not folder.is_dir()):
             raise StageError(f"{path if folder.is_dir() else folder} exists already; give a new folder")
+    if any(path.suffix.lower() in SUFFIXES for path in folder.glob("*")):
+        raise StageError(f"{folder} holds photos, and the project would lie among them; give a folder of its own")
     for name, text in texts.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
@@ -77,7 +78,10 @@ def make_project(folder: Path, scene: Path | None, objects: Sequence[Path], pres
         said = "the scene" if path is scene else "an object"
         said += "" if name == _stem(path) else f", called {name} (names hold only A-Z, a-z, 0-9, _ and -)"
         if path.is_dir():
-            said += f", {in_folders([f.relative_to(path).as_posix() for f in photo_files(path)])}"
+            names = [file.relative_to(path).as_posix() for file in photo_files(path)]
+            # README.md says how to photograph.
+            few = ", which is few: every part has to be in three or more; an object takes 30 to 100, from all sides"
+            said += f", {in_folders(names)}{few if len(names) < 30 else ''}"
         print(f"{path}: {said}", flush=True)
     return rows
 
@@ -102,10 +106,10 @@ def project_rows(folder: Path, scene: Path | None, objects: Sequence[Path]) -> d
 
 
 def fill(table: Path, column: str, cells: Mapping[str, str]) -> None:
-    """Write the cells of a column of a table of objects, by their names."""
+    """Write the cells of a column of a table of objects, by their names; unknown ones get a row."""
     rows = read_table(table, "object")
     for name, cell in cells.items():
-        rows[name][column] = cell
+        rows.setdefault(name, {"object": name})[column] = cell
     columns = tuple(dict.fromkeys([*next(iter(rows.values())), column]))
     with atomic_file(table) as temporary:
         temporary.write_text(_table(columns, rows.values()), encoding="utf-8")
@@ -137,6 +141,9 @@ def _source(path: Path, folder: Path, *, video: bool) -> dict[str, str]:
         raise StageError(f"{path} is not {wanted.replace('or a', 'nor a')} ({', '.join(READERS)})")
     elif path.stat().st_size == 0:
         raise StageError(f"{path} is empty; export it again")
+    elif suffix in TEXTS:
+        # Notes are text too.
+        next(columns_in_parts(path)())
     return {"cloud" if is_cloud else "photos": cell_of(path, folder)}
 
 

@@ -105,10 +105,10 @@ def _checked_table(name: str, kind: str) -> dict[str, Row]:
     if not path.is_file():
         raise StageError(f"{name} does not exist; write it as {ROOT}/config/README.md describes")
     rows = read_table(path, kind)
-    for number, row in enumerate(rows.values(), 1):
+    for of, row in rows.items():
         wrong = problem(row, schema_of(f"{kind}s"))
         if wrong:
-            raise StageError(f"{name}, row {number}, {wrong}")
+            raise StageError(f"{name}, {kind} '{of}', column {wrong}")
     # A path that begins like an option must not be taken for one.
     return {
         of: {key: f"./{cell}" if cell.startswith("-") else cell for key, cell in row.items()}

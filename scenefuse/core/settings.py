@@ -74,8 +74,8 @@ def problem_at(content: Any, schema: Mapping[str, Any]) -> tuple[list[Any], str 
             known = list(error.schema["properties"])
             unknown = next(name for name in error.instance if name not in known)
             close = difflib.get_close_matches(str(unknown), known, 1)
-            advice = f"did you mean '{close[0]}'?" if close else f"known keys are: {', '.join(known)}"
-            keys, message = [*keys, unknown], f"unknown key '{unknown}'; {advice}"
+            advice = f"did you mean '{close[0]}'?" if close else f"known are: {', '.join(known)}"
+            keys, message = [*keys, unknown], f"'{unknown}' is unknown; {advice}"
         elif error.validator == "type" and error.instance is None:
             message = "nothing stands behind or below it; remove the line, or fill it in"
         elif error.validator == "pattern" and "advice" in error.schema:

@@ -85,7 +85,8 @@ def run(function: Callable[..., Any]) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _exit_on_signal)
     try:
-        status = tyro.cli(function, config=(tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes))
+        markers = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
+        status = tyro.cli(function, config=markers)
     except SystemExit as stop:
         # tyro's, of words that it does not know.
         if stop.code == 2 and "SCENEFUSE" in os.environ:

@@ -122,10 +122,10 @@ def photo_files(folder: Path) -> list[Path]:
             " EXIF data kept, or take them out of the folder"
         )
     if not photos:
-        raise StageError(
-            f"the photo folder {folder} holds no photos; put JPEG, PNG, TIFF or BMP files there"
-            f" ({len(files)} other files were found)"
-        )
+        video = next((file for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)
+        found = f"{len(files)} other files were found"
+        found = f"as an object, give the video itself: {video}" if video else found
+        raise StageError(f"the photo folder {folder} holds no photos; put JPEG, PNG, TIFF or BMP files there ({found})")
     return sorted(photos, key=lambda file: file.relative_to(folder).as_posix())
 
 

@@ -94,4 +94,4 @@ def test_a_wrong_setting_of_the_module_is_named(yard):
     (yard / "mine.yaml").write_text("completion: { fusion: { mod: fill } }\n")
     (yard / "Snakefile").write_text(OTHER.format(snakefile=ROOT / "workflow/Snakefile"))
     status, output = plan(yard)
-    assert status != 0 and "fusion: unknown key 'mod'; did you mean 'mode'?" in output
+    assert status != 0 and "fusion: 'mod' is unknown; did you mean 'mode'?" in output

@@ -36,7 +36,7 @@ def _forked(cwd: Path, arguments: list[str]) -> subprocess.CompletedProcess[str]
                 os.chdir(cwd)
                 main(arguments)
             except SystemExit as end:
-                status = end.code if isinstance(end.code, int) else int(bool(end.code))
+                status = end.code if isinstance(end.code, int) else int(bool(end.code and not print(end.code)))
             finally:
                 sys.stdout.flush()
                 sys.stderr.flush()

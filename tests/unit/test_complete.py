@@ -76,8 +76,18 @@ def test_the_same_command_goes_on_and_other_folders_are_another_project(two_fold
     run("close")
     assert "Going on with flight_completed" in capsys.readouterr().out
     Project(two_folders).photos("shed")
-    with pytest.raises(StageError, match=r"flight_completed holds another project \(objects: close\); delete it, give"):
-        run("close", "shed")
+    with pytest.raises(StageError, match=r"flight_completed holds another project \(objects: close\); delete it, or"):
+        run("shed")
+
+
+def test_more_objects_are_added_by_a_command_that_names_the_others_too(two_folders, workflow):
+    workflow(SUMMARY)
+    run("close", prompts=(Path("clicks.tsv"),))
+    Project(two_folders).photos("shed")
+    workflow("")
+    run("close", "shed", prompts=(Path("clicks.tsv"), Path("clicks.tsv")))
+    rows = read_table(Path("flight_completed/config/objects.tsv"), "object")
+    assert [row["photos"] for row in rows.values()] == [str(two_folders / name) for name in ("close", "shed")]
 
 
 def test_a_second_run_in_the_same_project_is_refused_and_leaves_the_first_ones_log(two_folders, workflow):
@@ -118,19 +128,27 @@ def test_masks_take_the_place_of_clicks(two_folders, workflow):
     [
         ({"prompts": (Path("clicks.tsv"), Path("clicks.tsv"))}, "--prompts names 2 for 1 objects; give one for each"),
         ({"masks": (Path("nowhere"),)}, "nowhere does not exist; correct --masks"),
+        ({"cores": 0}, "--cores 0 cannot be had; give 1 to"),
+        ({"cores": 9999}, "--cores 9999 cannot be had; give 1 to"),
         ({"out": Path("close")}, "the project close would lie among its photos in close"),
     ],
 )
-def test_what_cannot_be_used_is_one_sentence(two_folders, options, sentence):
+def test_what_cannot_be_used_is_one_sentence_before_anything_is_made(two_folders, options, sentence):
     with pytest.raises(StageError, match=sentence):
         run("close", **options)
+    assert not list(two_folders.rglob("objects.tsv"))
 
 
 def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
-    (two_folders / "empty").mkdir()
+    for name in ("empty", "filmed"):
+        (two_folders / name).mkdir()
+    Path("filmed/clip.MP4").touch()
+    Path("notes.txt").write_text("Flight of 12 May\nwindy\n")
     Project(two_folders).photos("one", 1)
     for folder, sentence in (
         ("empty", "the photo folder empty holds no photos"),
+        ("filmed", r"filmed holds no photos; .*\(as an object, give the video itself: filmed/clip.MP4\)"),
+        ("notes.txt", r"notes.txt is not a readable TXT cloud \(none of its first lines holds three numbers"),
         ("one", "one holds 1 photo; cameras need three or more"),
         ("flight", "flight is given as the scene and as an object"),
     ):
@@ -221,16 +239,23 @@ def test_the_help_of_run_is_one_screen(monkeypatch, capsys):
     assert "--cores N" in said and "python -m snakemake --help" in said and len(said.splitlines()) < 24
 
 
-def test_init_ends_with_the_next_command_by_its_real_names(two_folders, capsys):
-    init(Path("yard"), scene=Path("flight"), objects=(Path("close"),))
-    assert "next: cd yard && scenefuse pick --object close " in capsys.readouterr().out
+def test_init_ends_with_the_next_command_by_its_real_names_and_says_how_many_photos_are_few(two_folders, capsys):
+    Project(two_folders).photos("many", 30)
+    init(Path("yard"), scene=Path("many"), objects=(Path("close"),))
+    said = capsys.readouterr().out
+    assert "next: cd yard && scenefuse pick --object close " in said
+    assert "many: the scene, 30 photos\n" in said and "close: an object, 3 photos, which is few: every part" in said
+    init(Path("bare"))
+    assert "next: cd bare, and fill in both tables in config/ " in capsys.readouterr().out
+    with pytest.raises(StageError, match="close holds photos, and the project would lie among them; give a folder of"):
+        init(Path("close"))
     assert "`scenefuse pick --object close`" in Path("yard/README.md").read_text()
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("seed: 1\nobject:\n  nerf:\n    widht: 3\n", "line 4, object.nerf: unknown key 'widht'; did you mean 'width'"),
+        ("seed: 1\nobject:\n  nerf:\n    widht: 3\n", "line 4, object.nerf: 'widht' is unknown; did you mean 'width'"),
         ("seed: 1\nobject: { nerf: { width: x } }\n", "line 2, object.nerf.width: 'x' is not of type 'integer'"),
         ("registration:\n  variants: [full, 3]\n", "line 2, registration.variants.1: 3 is not of type"),
         (

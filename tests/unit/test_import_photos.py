@@ -430,7 +430,7 @@ def test_exact_masks_have_no_band_that_is_left_out():
         ({"data": Path("nowhere")}, "the cameras nowhere do not exist"),
         ({"out": Path("file.txt")}, "is a file"),
         ({"masks": Path("none")}, "--masks none is no folder"),
-        ({"config": Path("typo.yaml")}, "unknown key 'levls'; did you mean 'levels'"),
+        ({"config": Path("typo.yaml")}, "'levls' is unknown; did you mean 'levels'"),
     ],
 )
 def test_wrong_flags_are_one_sentence(tmp_path, monkeypatch, options, words):

@@ -170,7 +170,7 @@ def test_a_column_with_a_space_in_its_name_is_written(tmp_path, house, monkeypat
         ({"fiducials": Path("clicks.tsv")}, "clicks in photos"),
         (
             {"config": Path("typo.yaml")},
-            "registration.fine: unknown key 'max_scale_sd'; did you mean 'max_scale_sd_",
+            "registration.fine: 'max_scale_sd' is unknown; did you mean 'max_scale_sd_",
         ),
         ({"config": Path("none.yaml")}, "cannot be read"),
         ({"object": Path("few.ply")}, "the object has only 3 different positions; 200 or more"),

@@ -189,7 +189,7 @@ def test_a_scene_has_settings_of_its_own_too(own_project):
         (
             "object: {nerf: {widht: 1}}",
             "objects",
-            "object 'shed': own.yaml, line 1, object.nerf: unknown key 'widht'",
+            "object 'shed': own.yaml, line 1, object.nerf: 'widht' is unknown",
         ),
         (
             "scene: {matches: {max_ratio: 0.8}}",
@@ -224,7 +224,7 @@ def test_the_variant_that_is_fused_comes_first_in_whatever_order_they_are_writte
 @pytest.mark.parametrize(
     "changes, sentence",
     [
-        ({"scene": {"matches": {"max_rati": 0.8}}}, "config, scene.matches: unknown key 'max_rati'; did you mean"),
+        ({"scene": {"matches": {"max_rati": 0.8}}}, "config, scene.matches: 'max_rati' is unknown; did you mean"),
         (
             {"fusion": {"mode": "fil"}},
             r"config, fusion.mode: 'fil' is not one of \['evidence', 'fill', 'append', 'replace'\]",
@@ -244,8 +244,14 @@ def test_a_bad_setting_is_one_sentence_with_its_key(project, changes, sentence):
     "rows, sentence",
     [
         ({"object_row": "shed\tgarden\tclose"}, "object 'shed' lies in scene 'garden', which scenes.tsv does not list"),
-        ({"object_row": "-shed\tyard\tclose"}, "objects.tsv, row 1, object: '-shed' will not do; use letters, digits"),
-        ({"scene_row": "-yard\tflight"}, "scenes.tsv, row 1, scene: '-yard' will not do.*no - at the beginning"),
+        (
+            {"object_row": "-shed\tyard\tclose"},
+            "objects.tsv, object '-shed', column object: '-shed' will not do; use letters",
+        ),
+        (
+            {"scene_row": "-yard\tflight"},
+            "scenes.tsv, scene '-yard', column scene: '-yard' will not do.*no - at the beginning",
+        ),
         ({"object_row": "shed\tyard\t"}, "objects.tsv: object .shed. has neither photos nor cloud; fill one of these"),
         ({"scene_row": "", "object_row": ""}, "scenes.tsv and objects.tsv have no rows; add one for each scene"),
     ],
@@ -254,6 +260,12 @@ def test_a_bad_setting_is_one_sentence_with_its_key(project, changes, sentence):
 def test_a_bad_row_is_one_sentence_with_its_table(project, rows, sentence):
     with pytest.raises(StageError, match=sentence):
         project(**rows)
+
+
+def test_a_misspelt_column_is_named_as_a_column(tmp_path):
+    (tmp_path / "scenes.tsv").write_text("scene\tfotos\nyard\tflight\n")
+    with pytest.raises(StageError, match="scenes.tsv, scene 'yard', column 'fotos' is unknown; did you mean 'photos'"):
+        read_project({"scenes": str(tmp_path / "scenes.tsv")})
 
 
 def test_a_section_that_stands_twice_is_named_where_snakemake_has_read_the_file(tmp_path):

@@ -17,7 +17,7 @@ def mask_inputs(wildcards):
     try:
         folders = mask_folders(kept_masks(wildcards))
     except StageError as error:
-        raise WorkflowError(str(error)) from None
+        refuse(str(error))
     where = f"object.masks.keep of '{wildcards.object}'"
     files = [file for folder in folders for file in photos_in(str(folder), where)]
     if row.get("masks"):
@@ -25,7 +25,7 @@ def mask_inputs(wildcards):
             row["masks"], f"{config['objects']}, masks of '{wildcards.object}'"
         )
     if not row.get("prompts"):
-        raise WorkflowError(
+        refuse(
             f"{config['objects']}: '{wildcards.object}' has neither prompts nor masks; fill one of these columns"
         )
     check_clicks(wildcards.object, "prompts")

@@ -5,7 +5,7 @@ def truth_of(scene):
     """The truth of a scene that an object with known truth lies in."""
     truth = scene_row(scene).get("truth")
     if not truth:
-        raise WorkflowError(
+        refuse(
             f"{config['scenes']}: scene '{scene}' has no truth, but an object in it has; fill both or neither"
         )
     return truth

@@ -156,9 +156,7 @@ def refuse_read_only_folders():
     }
     frozen = sorted(str(folder) for folder in folders if not os.access(folder, os.W_OK))
     if frozen:
-        raise WorkflowError(
-            f"{', '.join(frozen)} cannot be written to; check who may write there"
-        )
+        refuse(f"{', '.join(frozen)} cannot be written to; check who may write there")
 
 
 def forecast_run():
@@ -198,7 +196,7 @@ def forecast_run():
             by_rule, cores, memory, memory_mb(), needed, config["keep_maps"]
         )
     except StageError as error:
-        raise WorkflowError(str(error)) from None
+        refuse(str(error))
 
 
 def held_up(rule):

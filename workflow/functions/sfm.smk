@@ -5,9 +5,7 @@ from scenefuse.photos.photo_files import frame_name, thin_out
 def photos_of(row, who):
     """The cell `photos` of a row; a scene or object that is given as a cloud alone has none."""
     if not row.get("photos"):
-        raise WorkflowError(
-            f"{who} is given as a cloud: nothing is made from photos of it"
-        )
+        refuse(f"{who} is given as a cloud: nothing is made from photos of it")
     return row["photos"]
 
 
@@ -96,9 +94,7 @@ def check_survey(scene):
         try:
             check_survey_files(photo_names(Path(row["photos"])), **own)
         except StageError as error:
-            raise WorkflowError(
-                f"{config['scenes']}, scene '{scene}': {error}"
-            ) from None
+            refuse(f"{config['scenes']}, scene '{scene}': {error}")
 
 
 @cache
@@ -113,7 +109,7 @@ def crs_of(scene):
         where = f"{config['scenes']}, scene '{scene}', column crs"
         projected_crs(row["crs"], where, heights=bool(row.get("cloud")))
     except StageError as error:
-        raise WorkflowError(str(error)) from None
+        refuse(str(error))
     return {"crs": row["crs"]}
 
 
@@ -146,7 +142,7 @@ def check_cloud_crs(scene, file):
     try:
         cloud_crs(Path(file), crs_of(scene).get("crs"))
     except StageError as error:
-        raise WorkflowError(f"{config['scenes']}, scene '{scene}': {error}") from None
+        refuse(f"{config['scenes']}, scene '{scene}': {error}")
 
 
 def lie_on_flag(wildcards):
@@ -204,9 +200,7 @@ def check_clicks(name, column):
             try:
                 check_marks(Path(file), photos, used)
             except StageError as error:
-                raise WorkflowError(
-                    f"{config['objects']}, object '{name}': {error}"
-                ) from None
+                refuse(f"{config['objects']}, object '{name}': {error}")
 
 
 @cache
@@ -222,9 +216,7 @@ def check_lengths(name):
                 names = [frame_name(photo) for photo in photo_names(Path(photos))]
                 check_survey_files(names, lengths=Path(file))
             except StageError as error:
-                raise WorkflowError(
-                    f"{config['objects']}, object '{name}': {error}"
-                ) from None
+                refuse(f"{config['objects']}, object '{name}': {error}")
 
 
 def given_of(wildcards):

@@ -10,7 +10,6 @@ import sys
 from functools import cache
 from pathlib import Path
 
-from snakemake.exceptions import WorkflowError
 from snakemake.output_index import OutputIndex
 
 from scenefuse.core.fingerprint import files_fingerprint, fingerprint
@@ -23,29 +22,35 @@ from scenefuse.core.stage import DISK_FULL, MIN_FREE_BYTES, StageError
 # A file that a run holds until it ends, among Snakemake's locks and removed with them.
 RUN_LOCK = Path(".snakemake/locks/run")
 
+
+def refuse(sentence):
+    """End before the first job. An exception, of which Snakemake would print a traceback, would hide the sentence in it."""
+    sys.exit(f"error: {sentence}")
+
+
 # The folder above workflow/; where another workflow has fetched this one from the web, that of the installed library.
 if workflow.modifier.path_modifier.replace_prefix("results") != "results":
-    raise WorkflowError(
+    refuse(
         "scenefuse names its files in commands and settings too, which `prefix` and `replace_prefix` of a module do not"
         " reach; leave them out"
     )
 if set("{}") & set(os.getcwd()):
-    raise WorkflowError(
+    refuse(
         f"Snakemake takes the braces in {os.getcwd()} for wildcards; rename the folder, or work in another one"
     )
 # Snakemake itself, and its log of an error, would end in tracebacks.
 for folder in filter(os.path.exists, (os.getcwd(), ".snakemake", "results")):
     if not os.access(folder, os.W_OK):
-        sys.exit(f"error: {folder} cannot be written to; check who may write there")
+        refuse(f"{folder} cannot be written to; check who may write there")
 if shutil.disk_usage(os.getcwd()).free < MIN_FREE_BYTES:
-    sys.exit(f"error: {DISK_FULL.format(f' ({os.getcwd()})')}")
+    refuse(DISK_FULL.format(f" ({os.getcwd()})"))
 ROOT = Path(str(workflow.current_basedir)).parents[1]
 if not (ROOT / "scripts").is_dir():
     ROOT = SHIPPED
 # Where jobs import the library from: the clone, or where it was installed.
 LIBRARY = ROOT if (ROOT / "scenefuse").is_dir() else PACKAGE.parent
 if LIBRARY != ROOT and workflow.deployment_settings.deployment_method:
-    raise WorkflowError(
+    refuse(
         "the environments of --sdm lack scenefuse where it was installed by pip; leave --sdm out, or run the workflow of"
         " a clone"
     )
@@ -59,7 +64,7 @@ os.environ.update(
 try:
     PROJECT = read_project(config, map(Path, workflow.overwrite_configfiles))
 except StageError as error:
-    raise WorkflowError(str(error)) from None
+    refuse(str(error))
 config.update(PROJECT.settings)
 SCENES, OBJECTS, VARIANTS = PROJECT.scenes, PROJECT.objects, PROJECT.variants
 # Objects that lie in a scene, and those by themselves: their cloud is the result.
@@ -131,9 +136,7 @@ def row_of(name, rows, table):
     """A row of SCENES or OBJECTS."""
     if name not in rows:
         kind = table.removesuffix("s")
-        raise WorkflowError(
-            f"unknown {kind} '{name}'; {config[table]} lists: {', '.join(rows)}"
-        )
+        refuse(f"unknown {kind} '{name}'; {config[table]} lists: {', '.join(rows)}")
     return rows[name]
 
 
@@ -156,7 +159,7 @@ def own_file(kind, name, column):
             "prompts": f"; {click}, or correct the path",
             "fiducials": f"; {click}, or leave the cell empty",
         }
-        raise WorkflowError(
+        refuse(
             f"{config[f'{kind}s']}, {kind} '{name}': {path} in the column {column} does not exist (relative paths"
             f" begin at {os.getcwd()}){advice.get(column, '')}"
         )
@@ -188,7 +191,7 @@ def scene_of(wildcards):
     """The name of the scene that the object lies in."""
     scene = object_row(wildcards.object).get("scene")
     if not scene:
-        raise WorkflowError(
+        refuse(
             f"{config['objects']}: object '{wildcards.object}' lies in no scene, so it has nothing beyond"
             f" results/objects/{wildcards.object}/object.ply and figures/; name its scene in the column scene"
         )
@@ -341,16 +344,14 @@ def photos_in(path, where):
     if made_here(path) or Path(path).is_file():
         return [path]
     if Path.cwd().is_relative_to(Path(path).resolve()):
-        raise WorkflowError(
+        refuse(
             f"{where}: the project lies in its folder of photos, {path}, whose files would count as photos; put the"
             " photos, or the project, into a folder of its own"
         )
     try:
         return [str(file) for file in photo_files(Path(path))]
     except StageError as error:
-        raise WorkflowError(
-            f"{where}: {error} (relative paths begin at {os.getcwd()})"
-        ) from None
+        refuse(f"{where}: {error} (relative paths begin at {os.getcwd()})")
 
 
 def as_inputs(files):
@@ -386,6 +387,8 @@ def flags(settings):
     """Settings as command line flags: {"max_size_px": 2000} -> --max-size-px 2000."""
     words = []
     for key, value in sorted(settings.items()):
+        if value is None:
+            continue
         values = value if isinstance(value, list) else [value]
         words += [f"--{key.replace('_', '-')}", *(shlex.quote(str(v)) for v in values)]
     return " ".join(words)

@@ -30,7 +30,7 @@ rule compute_metrics:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        fused=lambda wildcards, input: input.get("fused", "None"),
+        fused=options_of("fused"),
         seed=config["seed"],
         script=script("metrics/compute_metrics.py"),
         code=code("metrics/compute_metrics.py"),
@@ -38,7 +38,7 @@ rule compute_metrics:
         "{wildcards.object}: metrics"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json} --fine-json {input.fine}"
-        " --fused {params.fused} --report {output} --seed {params.seed} &> {log}"
+        " {params.fused} --report {output} --seed {params.seed} &> {log}"
 
 
 use rule compute_metrics as compute_variant_metrics with:
