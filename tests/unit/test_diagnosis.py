@@ -41,7 +41,14 @@ def test_nothing_is_said_where_all_is_well_or_nothing_has_run():
         ({"sparse__not_registered": ["x.jpg", "y.jpg"]}, ["could not be placed (2): x.jpg, y.jpg"]),
         (
             {"sparse__not_registered": ["x.jpg", "y.jpg"], "sparse__models_left_out": [{"photos": ["y.jpg", "z.jpg"]}]},
-            ["not linked to the rest (1): y.jpg", "placed (1): x.jpg"],
+            ["not linked to the rest (1): y.jpg;", "placed (1): x.jpg"],
+        ),
+        (
+            {
+                "sparse__not_registered": ["u.jpg", "v.jpg", "w.jpg"],
+                "sparse__models_left_out": [{"photos": ["v.jpg", "w.jpg"]}, {"photos": ["u.jpg"]}],
+            },
+            ["not linked to the rest (2): v.jpg, w.jpg; u.jpg; photograph"],
         ),
         ({"sparse__doubtful_photos": {"b.jpg": 0.6, "a.jpg": 0.7}}, ["in wrong places (2): a.jpg, b.jpg"]),
         ({"undistorted__largest_gap_deg": 190.0}, ["190 degrees without a photo, between a.jpg and b.jpg"]),
