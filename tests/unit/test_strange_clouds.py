@@ -1,7 +1,9 @@
 """Cloud files as people have them: situations of public complaints about other programs (docs/inputs.md), read
 right."""
 
+import io
 import struct
+from base64 import b64encode
 from pathlib import Path
 
 import laspy
@@ -11,6 +13,7 @@ import pyproj
 import pytest
 from laspy.vlrs.known import GeoKeyDirectoryVlr
 from PIL import Image
+from plyfile import PlyData, PlyElement
 from pye57 import libe57
 from support.glb_file import write_square as glb
 
@@ -189,6 +192,11 @@ def test_columns_without_names_are_colours_only_where_they_must_be(tmp_path):
     assert any("columns 4 to 6 are taken for red, green and blue" in note for note in read.notes)
 
 
+def test_colours_behind_normals_that_are_0_0_0_are_found(tmp_path):
+    (tmp_path / "a.txt").write_text("\n".join(rows(" ", *np.zeros((3, 40)), *zip(*COLORS))))
+    assert read_cloud(tmp_path / "a.txt").colors.tolist() == COLORS
+
+
 @pytest.mark.parametrize("most", [1.0, 255.0])
 def test_real_colours_that_overshoot_a_little_are_clipped(tmp_path, most):
     share = np.linspace(0, 1, 40)
@@ -336,7 +344,7 @@ def halves(path):
     """A picture whose left half is red, its right half blue."""
     picture = np.zeros((8, 8, 3), np.uint8)
     picture[:, :4, 0], picture[:, 4:, 2] = 255, 255
-    Image.fromarray(picture).save(path)
+    Image.fromarray(picture).save(path, None if isinstance(path, Path) else "PNG")
 
 
 @pytest.mark.parametrize(
@@ -379,6 +387,82 @@ def sides(path):
         read.normals.mean(0),
         np.ptp(read.points, axis=0),
     )
+
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float64)
+
+
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize("of", ["corners", "vertices", "faces"])
+def test_a_mesh_in_ply_has_the_colours_of_its_textures_or_faces(tmp_path, text, of):
+    halves(tmp_path / "T 1.PNG")
+    vertex = np.zeros(4, [(name, "f4") for name in ("x", "y", "z", "s", "t")][: 5 if of == "vertices" else 3])
+    for name, values in zip("xyzst", CORNERS[:, [0, 1, 2, 0, 1]].T):
+        if name in vertex.dtype.names:
+            vertex[name] = values
+    faces, kind = [([0, 1, 2, 3], [], 0)], [("vertex_index", "i4", (4,)), ("texcoord", "f4", (8,)), ("red", "u1")]
+    if of == "corners":
+        faces = [([0, 1, 2, 3], CORNERS[:, :2].ravel(), 0)]
+    elif of == "faces":  # each half a face of its own
+        vertex = np.concatenate([vertex, vertex[:2]])
+        vertex["x"][4:], vertex["y"][4:] = 0.5, (0, 1)
+        faces = [([0, 4, 5, 3], [], 255), ([4, 1, 2, 5], [], 0)]
+        kind += [("green", "u1"), ("blue", "u1")]
+    face = np.empty(len(faces), [(name, "O" if rest else code) for name, code, *rest in kind])
+    for row, (corners, places, red) in zip(face, faces):
+        row["vertex_index"], row["texcoord"], row["red"] = np.array(corners), np.array(places, np.float32), red
+        if of == "faces":
+            row["green"], row["blue"] = 0, 255 - red
+    elements = [PlyElement.describe(vertex, "vertex")]
+    elements.append(
+        PlyElement.describe(
+            face, "face", len_types={"texcoord": "u1"}, val_types={"vertex_index": "i4", "texcoord": "f4"}
+        )
+    )
+    PlyData(elements, text, comments=["TextureFile t 1.png"]).write(tmp_path / "a.ply")
+    left, right, normal, _ = sides(tmp_path / "a.ply")
+    assert (left, right) == pytest.approx((0.25, 0.75), abs=0.01) and normal == pytest.approx([0, 0, 1])
+
+
+@pytest.mark.parametrize("faces", [True, False])
+def test_numbers_of_a_big_endian_ply_are_written_as_they_were(tmp_path, faces):
+    vertex = np.zeros(40, [(axis, ">f8") for axis in "xyz"] + [("scalar_quality", ">f4"), ("class", ">i4")])
+    for axis, values in zip("xyz", np.array(GRID).T):
+        vertex[axis] = values
+    vertex["scalar_quality"], vertex["class"] = 0.5, 7
+    elements = [PlyElement.describe(vertex, "vertex")]
+    if faces:  # none, but their lists are read otherwise
+        empty = np.empty(0, [("vertex_indices", "O")])
+        elements.insert(0, PlyElement.describe(empty, "face", val_types={"vertex_indices": "i4"}))
+    PlyData(elements, byte_order=">").write(tmp_path / "a.ply")
+    write_cloud(tmp_path / "b.ply", read_cloud(tmp_path / "a.ply"))
+    written = read_cloud(tmp_path / "b.ply")
+    np.testing.assert_allclose(written.points, GRID)
+    assert (written.fields["quality"] == 0.5).all() and (written.fields["class"] == 7).all()
+
+
+@pytest.mark.parametrize("kind", ["diffuse", "emissive", "data"])
+def test_a_glb_has_the_colours_of_older_and_of_shining_materials(tmp_path, kind, capsys):
+    def change(document):
+        material = document["materials"][0]
+        if kind == "data":
+            view = document["bufferViews"][3]
+            stream = io.BytesIO()
+            halves(stream)
+            document["images"] = [{"uri": "data:image/png;base64," + b64encode(stream.getvalue()).decode()}]
+            view["byteLength"] = 4
+            return
+        texture = material["pbrMetallicRoughness"].pop("baseColorTexture")
+        material["pbrMetallicRoughness"]["baseColorFactor"] = [0, 0, 0, 1]
+        if kind == "emissive":
+            material |= {"emissiveTexture": texture, "emissiveFactor": [1, 1, 1]}
+        else:
+            material["extensions"] = {"KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": texture}}
+            document["extensionsUsed"] = ["KHR_materials_pbrSpecularGlossiness"]
+
+    glb(tmp_path / "a.glb", change)
+    assert sides(tmp_path / "a.glb")[:2] == pytest.approx([0.25, 0.75], abs=0.01)
+    assert "not read" not in capsys.readouterr().out
 
 
 def test_a_glb_whose_texture_is_webp_alone(tmp_path):
@@ -508,6 +592,16 @@ def test_a_site_s_own_system_is_taken_as_such(tmp_path, name):
     assert value(place, "length_unit") == "m" and "works" in value(place, "crs") and not has_place(value(place, "crs"))
     with pytest.raises(StageError, match="works is a site's own system, which has no place on the earth"):
         to_wgs84(pyproj.CRS.from_wkt(value(place, "crs")), np.zeros((1, 3)), "photos")
+
+
+@pytest.mark.parametrize("step", [0.0, np.nan])
+def test_a_las_header_whose_coordinates_count_in_no_steps_is_refused(tmp_path, step):
+    survey(tmp_path / "a.las", wkt=pyproj.CRS("EPSG:26918").to_wkt())
+    content = bytearray((tmp_path / "a.las").read_bytes())
+    struct.pack_into("<d", content, 131, step)
+    (tmp_path / "a.las").write_bytes(content)
+    with pytest.raises(StageError, match="its coordinates count in steps of"):
+        CloudFile.of(tmp_path / "a.las")
 
 
 @pytest.mark.parametrize(

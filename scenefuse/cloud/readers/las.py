@@ -99,6 +99,8 @@ def _check_header(path: Path) -> None:
         if len(head) < 227 or not head.startswith(b"LASF"):
             raise ValueError("it does not begin as LAS does")
         begin, records, kind, length, count = struct.unpack_from("<IIBHI", head, 96)
+        if not np.isfinite(scales := struct.unpack_from("<3d", head, 131)).all() or not all(scales):
+            raise ValueError(f"its coordinates count in steps of {scales}")
         if head[25] >= 4 and len(head) == 375:
             start, more, long_count = struct.unpack_from("<QIQ", head, 235)
             count = long_count or count

@@ -6,6 +6,7 @@ Read here and not by Open3D, whose readers take positions as float32: at UTM coo
 import io
 import json
 import re
+from base64 import b64decode
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -23,11 +24,12 @@ Array = NDArray[np.float64]
 MESH_POINTS = 500_000
 # Extensions of glTF that are read, or change neither shapes nor the colours of surfaces.
 READ_EXTENSIONS = re.compile(
-    "EXT_texture_webp|EXT_mesh_gpu_instancing|KHR_(texture_transform|mesh_quantization|materials_(?!pbrSpec|variants)"
+    "EXT_texture_webp|EXT_mesh_gpu_instancing|KHR_(texture_transform|mesh_quantization|materials_(?!variants)"
     "|lights|xmp|node_visibility)|(MSFT|ADOBE|FB|AGI)_"
 )
 # What may stand before the file of a texture in a line of a material.
 OPTIONS = re.compile(r"(?:-[A-Za-z]+(?:\s+(?:[-+]?[\d.]+(?:[eE][-+]?\d+)?|on|off)(?=\s))*\s+)*")
+DIFFUSE = "KHR_materials_pbrSpecularGlossiness"
 INSTANCE_PARTS = ("TRANSLATION", "ROTATION", "SCALE")
 
 
@@ -284,8 +286,7 @@ def _materials(path: Path) -> dict[str, Material]:
             found[name] = replace(found[name], color=color if len(color) == 3 else Material.color)
         elif word.lower() == "map_kd" and name:
             options = OPTIONS.match(rest)
-            file = _beside(path.parent, rest[options.end() if options else 0 :])
-            picture = _picture(file.read_bytes() if file.is_file() else b"", str(file))
+            picture = picture_beside(path.parent, rest[options.end() if options else 0 :])
             found[name] = replace(found[name], picture=picture, place=_placed(options[0] if options else ""))
     return found
 
@@ -297,6 +298,12 @@ def _placed(options: str) -> Array:
         first = np.array([float(cell) for cell in numbers.split()[:2]])
         place[np.arange(len(first)), np.arange(len(first)) if letter == "s" else 2] = first
     return place
+
+
+def picture_beside(folder: Path, name: str) -> NDArray[np.uint8] | None:
+    """The picture that a file in a folder names; None, and a note, where it cannot be read."""
+    file = _beside(folder, name)
+    return _picture(file.read_bytes() if file.is_file() else b"", str(file))
 
 
 def _picture(content: bytes, name: str) -> NDArray[np.uint8] | None:
@@ -450,15 +457,26 @@ def _stored(
     return np.ndarray((count, width), kind, blob, start, (step, kind.itemsize))
 
 
+def _painted(document: dict[str, Any], material: int) -> tuple[dict[str, Any], list[float]]:
+    """What a material says of its texture, and its colour: by its base colour, as a diffuse one (older exports), or, of
+    one that shines and has no texture else, by its light."""
+    about = document["materials"][material]
+    base, old = about.get("pbrMetallicRoughness", {}), about.get("extensions", {}).get(DIFFUSE)
+    if old is not None:
+        return old.get("diffuseTexture", {}), old.get("diffuseFactor", [1, 1, 1])
+    if "emissiveTexture" in about and "baseColorTexture" not in base:
+        return about["emissiveTexture"], about.get("emissiveFactor", [1, 1, 1])
+    return base.get("baseColorTexture", {}), base.get("baseColorFactor", [1, 1, 1])
+
+
 def _texture(document: dict[str, Any], material: int) -> dict[str, Any]:
     """What a material says of its texture: `index`, and `texCoord`, `offset`, `scale`, `rotation` of its places."""
-    about = document["materials"][material].get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
+    about = _painted(document, material)[0]
     return about | about.get("extensions", {}).get("KHR_texture_transform", {})
 
 
 def _gltf_material(document: dict[str, Any], blob: bytes, number: int) -> Material:
-    about = document["materials"][number].get("pbrMetallicRoughness", {})
-    color = tuple(255 * part for part in about.get("baseColorFactor", [1, 1, 1])[:3])
+    color = tuple(255 * part for part in _painted(document, number)[1][:3])
     texture = _texture(document, number)
     if "index" not in texture:
         return Material(None, color)
@@ -466,8 +484,9 @@ def _gltf_material(document: dict[str, Any], blob: bytes, number: int) -> Materi
     source = sources.get("extensions", {}).get("EXT_texture_webp", sources).get("source")
     image = {} if source is None else document["images"][source]
     view = document["bufferViews"][image["bufferView"]] if "bufferView" in image else {"byteLength": 0}
-    start = view.get("byteOffset", 0)
-    picture = _picture(blob[start : start + view["byteLength"]], image.get("name", f"number {source}"))
+    start, uri = view.get("byteOffset", 0), image.get("uri", "")
+    content = b64decode(uri.partition(",")[2]) if uri.startswith("data:") else blob[start : start + view["byteLength"]]
+    picture = _picture(content, image.get("name", f"number {source}"))
     cos, sin = np.cos(texture.get("rotation", 0.0)), np.sin(texture.get("rotation", 0.0))
     place = np.eye(3)
     place[:2, :2] = np.array([[cos, -sin], [sin, cos]]) * texture.get("scale", [1, 1])

@@ -20,7 +20,7 @@ from scenefuse.cloud.readers.columns import (
     positions,
     typed,
 )
-from scenefuse.cloud.readers.meshes import Mesh, sampled_columns, triangles
+from scenefuse.cloud.readers.meshes import Array, Material, Mesh, picture_beside, sampled_columns, triangles
 from scenefuse.core.stage import StageError
 
 KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -32,8 +32,11 @@ TYPES = {name: kind for kind, name in NAMES.items()} | dict(
 
 # What fields are called by in a file: CloudCompare reads these without being told to.
 FIELD = "scalar_"
-# What the list of a face's corners is called.
-CORNERS = ("vertex_indices", "vertex_index")
+# What the list of a face's corners is called, and that of their places in a texture; those of vertices.
+CORNERS, PLACES = ("vertex_indices", "vertex_index"), "texcoord"
+PLACE_NAMES = (("texture_u", "texture_v"), ("s", "t"), ("u", "v"))
+# A line of the header that names a texture (VCG, MeshLab, Metashape).
+TEXTURE = "comment TextureFile "
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,8 @@ def in_rows(path: Path) -> bool:
 
 
 def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
-    """Points, so many rows at a time; where there are faces, points drawn from them, all at once.
+    """Points, so many rows at a time; where there are faces, points drawn from them, all at once, with the colours of
+    vertices, else of faces, else of a texture.
 
     Raises:
         StageError: the file is cut short, or a row of text is of another length.
@@ -98,16 +102,32 @@ def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
     if in_rows(path):
         yield from _rows(path, elements[0], offset, is_text, at_once)
         return
-    vertex, faces = _mesh_of_text(path, elements, offset) if is_text else _mesh_of_bytes(path)
+    vertex, face = _mesh_of_text(path, elements, offset) if is_text else _mesh_of_bytes(path)
+    vertex = dict(zip(common_names(list(vertex)), vertex.values()))
+    faces: Any = next((face[name] for name in CORNERS if name in face), [])
     if not len(faces) or not set(POSITION) <= set(vertex):
         yield vertex
         return
-    colors = colors_of(dict(zip(common_names(list(vertex)), vertex.values())))
-    colors = None if colors is None else bytes_of(colors).astype(np.float64)
-    points = positions(vertex)
-    rows = np.concatenate(faces).astype(np.int64)
-    corners = rows[triangles(np.array([len(face) for face in faces]), rows, points)[0]]
-    yield sampled_columns(Mesh(points, corners, colors, None, np.full(len(corners), -1)))
+    colors, points = colors_of(vertex), positions(vertex)
+    lengths, rows = np.array([len(corners) for corners in faces]), np.concatenate(faces).astype(np.int64)
+    places, of = triangles(lengths, rows, points)
+    uvs = next((np.stack([vertex[u], vertex[v]], axis=1)[rows] for u, v in PLACE_NAMES if {u, v} <= set(vertex)), None)
+    if PLACES in face and sum(map(len, face[PLACES])) == 2 * len(rows):
+        uvs = np.concatenate(face[PLACES]).astype(np.float64).reshape(-1, 2)
+    if colors is None and set(COLOR) <= set(face):
+        colors = np.repeat(np.array([face[name] for name in COLOR]).T, lengths, axis=0)
+        points, rows = points[rows], np.arange(len(rows))
+    painted = None if colors is None else bytes_of(colors).astype(np.float64)
+    textures = () if uvs is None else _textures(path)
+    numbers = np.array(face.get("texnumber", np.zeros(len(faces)))).astype(np.int64)[of]
+    yield sampled_columns(Mesh(points, rows[places], painted, None if uvs is None else uvs[places], numbers, textures))
+
+
+def _textures(path: Path) -> tuple[Material, ...]:
+    """The textures that a header names, by which faces are numbered."""
+    with open(path, "rb") as file:
+        names = [line.removeprefix(TEXTURE) for line in _lines(file) if line.startswith(TEXTURE)]
+    return tuple(Material(picture_beside(path.parent, name)) for name in names)
 
 
 def check_size(path: Path, elements: list[Element], offset: int, advice: str = "copy it again") -> None:
@@ -125,23 +145,22 @@ def _cut_short(path: Path, element: str, missing: int, advice: str = "copy it ag
     return StageError(f"{path} is cut short: its last {missing} {what} are missing; {advice}")
 
 
-def _mesh_of_bytes(path: Path) -> tuple[Columns, list[Any]]:
-    """The columns of the vertices, and the corners of each face."""
+def _mesh_of_bytes(path: Path) -> tuple[Columns, dict[str, Any]]:
+    """The columns of the vertices, and the properties of the faces by their names."""
     from plyfile import PlyData
 
     content = PlyData.read(path)
     vertex = content["vertex"].data
     names = [name for name in vertex.dtype.names if vertex.dtype[name].kind in "iuf"]
-    columns = {name.removeprefix(FIELD): np.array(vertex[name]) for name in names}
+    columns = {name.removeprefix(FIELD): vertex[name].astype(vertex.dtype[name].newbyteorder("=")) for name in names}
     face = content["face"].data if "face" in content else np.empty(0, [("", "u1")])
-    name = next((name for name in CORNERS if name in (face.dtype.names or ())), None)
-    return columns, [] if name is None else list(face[name])
+    return columns, {name: face[name] for name in face.dtype.names or ()}
 
 
-def _mesh_of_text(path: Path, elements: list[Element], offset: int) -> tuple[Columns, list[Any]]:
+def _mesh_of_text(path: Path, elements: list[Element], offset: int) -> tuple[Columns, dict[str, Any]]:
     """The same of a file of text."""
     vertex: Columns = {}
-    faces: list[list[int]] = []
+    faces: dict[str, Any] = {}
     with open(path, "rb") as file:
         file.seek(offset)
         for element in elements:
@@ -155,29 +174,31 @@ def _mesh_of_text(path: Path, elements: list[Element], offset: int) -> tuple[Col
             rows = list(islice((line for line in file if line.strip()), element.count))
             if len(rows) < element.count:
                 raise _cut_short(path, element.name, element.count - len(rows))
+            found = _with_lists(element, rows)
             if element.name == "face":
-                corners = (next((cells for name, cells in _cells(element, row) if name in CORNERS), []) for row in rows)
-                faces += [[int(float(cell)) for cell in cells] for cells in corners]
+                faces = found
             elif element.name == "vertex":
-                vertex = _beside_lists(element, rows)
+                vertex = {name: values for name, values in found.items() if element.kinds[name] != "list"}
     return vertex, faces
 
 
-def _cells(element: Element, row: bytes) -> Iterator[tuple[str, list[bytes]]]:
-    """The properties of a row of text that holds lists, and the cells of each."""
-    cells, at = row.split(), 0
-    for name, kind in element.kinds.items():
+def _with_lists(element: Element, rows: list[bytes]) -> dict[str, Any]:
+    """The columns of rows of text that hold lists: arrays of numbers, and for each list a list of arrays."""
+    columns = zip(*(_cells(element, row.split()) for row in rows))
+    return {
+        name: column if kind == "list" else typed(np.concatenate(column), np.dtype(TYPES.get(kind, "f8")))
+        for (name, kind), column in zip(element.kinds.items(), columns)
+    }
+
+
+def _cells(element: Element, cells: list[bytes]) -> Iterator[Array]:
+    """The numbers of each property of a row."""
+    at = 0
+    for kind in element.kinds.values():
         is_list = kind == "list"
         end = at + (1 + int(float(cells[at])) if is_list else 1)
-        yield name, cells[at + is_list : end]
+        yield np.array(cells[at + is_list : end], np.float64)
         at = end
-
-
-def _beside_lists(element: Element, rows: list[bytes]) -> Columns:
-    """The columns of rows of text that hold lists as well; these are left out."""
-    kinds = {name: np.dtype(TYPES[kind]) for name, kind in element.kinds.items() if kind != "list"}
-    table = [[float(cells[0]) for name, cells in _cells(element, row) if name in kinds] for row in rows]
-    return {name: typed(np.array(values), kinds[name]) for name, values in zip(kinds, zip(*table))}
 
 
 def _rows(path: Path, element: Element, offset: int, is_text: bool, at_once: int) -> Iterator[Columns]:
@@ -192,7 +213,7 @@ def _rows(path: Path, element: Element, offset: int, is_text: bool, at_once: int
                 columns, line = _columns_of_text(path, file, element, most, line)
             else:
                 rows = np.fromfile(file, row, most)
-                columns = {name: np.ascontiguousarray(rows[name]) for name in row.names}
+                columns = {name: rows[name].astype(row[name].newbyteorder("=")) for name in row.names}
             count = len(next(iter(columns.values()), ()))
             if not count:
                 raise _cut_short(path, element.name, left)

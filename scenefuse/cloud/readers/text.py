@@ -239,7 +239,8 @@ def _unnamed(path: Path, rows: NDArray[np.float64]) -> tuple[dict[str, int], lis
     for first in range(start, rows.shape[1] - 2, 3):
         three = rows[:, first : first + 3]
         lengths = np.linalg.norm(three[np.isfinite(three).all(1)], axis=1)
-        kind = NORMAL if len(lengths) and (np.abs(lengths - 1) < UNIT_TOLERANCE).all() else COLOR
+        unit = (np.abs(lengths - 1) < UNIT_TOLERANCE) | (lengths == 0)  # some programs write 0 0 0 for no normal
+        kind = NORMAL if len(lengths) and unit.all() else COLOR
         if kind[0] in columns or (kind == COLOR and not colored(three)):
             break
         columns |= {name: first + k for k, name in enumerate(kind)}
