@@ -38,12 +38,19 @@ def read_raw(path: Path) -> NDArray[Any]:
 
 
 def matte_of(picture: NDArray[Any]) -> NDArray[np.bool_]:
-    """A mask picture as (H, W) bool: alpha where it varies, else brightness, above half of the largest value."""
+    """A mask picture as (H, W) bool: alpha where it varies, else brightness, above half of the largest value.
+
+    Raises:
+        StageError: most of it is grey, as of a photo.
+    """
     if picture.ndim == 3 and picture.shape[2] == 4 and picture[..., 3].min() < picture[..., 3].max():
         channel = picture[..., 3]
     else:
         channel = picture[..., :3].max(2) if picture.ndim == 3 else picture
-    return channel > max(1, channel.max()) / 2
+    shares = channel / max(1, channel.max())
+    if np.median(np.abs(shares - 0.5)) < 0.4:
+        raise StageError("it is no mask: most of it is grey")
+    return np.asarray(shares > 0.5)
 
 
 def stretched(pixels: NDArray[Any], bits: int) -> NDArray[np.uint8]:

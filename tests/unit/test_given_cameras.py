@@ -84,10 +84,10 @@ def nerfstudio(folder):
     return folder / "transforms.json"
 
 
-def opensfm(folder, kind="perspective"):
+def opensfm(folder, kind="perspective", bent=None):
     lens = {"projection_type": kind, "width": 2 * WIDTH, "height": 2 * HEIGHT, "k1": 0.0, "k2": 0.0}
     lens |= {"focal": FOCAL / WIDTH, "focal_x": FOCAL / WIDTH, "focal_y": FOCAL / WIDTH, "c_x": 0.0, "c_y": 0.0}
-    lens |= {"p1": 0.0, "p2": 0.0, "k3": 0.0}
+    lens |= {"p1": 0.0, "p2": 0.0, "k3": 0.0} if bent is None else bent
     shots = {}
     for view in FLIGHT.views:
         turn = Rotation.from_matrix(view.cam_from_world[:3, :3]).as_rotvec().tolist()
@@ -104,7 +104,7 @@ PLACED = "<transform><translation>4.2e6 6e5 4.75e6</translation><scale>3</scale>
 EARTH = f"<reference>{escape(pyproj.CRS(4326).to_wkt('WKT1_GDAL'))}</reference>{PLACED}"
 
 
-def metashape(folder, lens=LENS, placed=EARTH):
+def metashape(folder, lens=LENS, placed=EARTH, kind="frame"):
     """As Metashape exports it: labels without ending, a group, a photo that was not aligned."""
     inside = "".join(f"<{name}>{number}</{name}>" for name, number in lens.items())
     cameras = "".join(
@@ -113,9 +113,9 @@ def metashape(folder, lens=LENS, placed=EARTH):
         for k, view in enumerate(FLIGHT.views)
     )
     size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
-    calibration = f'<calibration type="frame" class="adjusted">{size}{inside}</calibration>'
+    calibration = f'<calibration type="{kind}" class="adjusted">{size}{inside}</calibration>'
     (folder / "cameras.xml").write_text(
-        f'<document><chunk><sensors><sensor id="0" type="frame">{size}{calibration}</sensor></sensors>'
+        f'<document><chunk><sensors><sensor id="0" type="{kind}">{size}{calibration}</sensor></sensors>'
         f'<cameras><group id="0">{cameras}</group><camera id="99" sensor_id="0" label="lost"/></cameras>'
         f"{placed}</chunk></document>"
     )
@@ -256,8 +256,8 @@ def test_wrong_cameras_are_named(tmp_path):
     path.write_text(json.dumps(content))
     with pytest.raises(StageError, match="do not fit the photos"):
         mapped(tmp_path, path)
-    opensfm(tmp_path, "fisheye")
-    with pytest.raises(StageError, match="of the kind fisheye"):
+    opensfm(tmp_path, "dual")
+    with pytest.raises(StageError, match="of the kind dual, which is not read; undistort"):
         read_posed_photos(tmp_path / "opensfm/reconstruction.json", tmp_path / "photos")
     (tmp_path / "opensfm/reconstruction.json").write_text("{}")
     with pytest.raises(StageError, match="holds no cameras of OpenSfM that can be read"):
@@ -449,6 +449,51 @@ def test_a_lens_of_metashape_projects_as_its_manual_says(tmp_path):
         assert np.linalg.norm(off, axis=1).max() < most
 
 
+FISHEYE = {"k1": -0.05, "k2": 0.01, "k3": 0.002, "k4": -0.001}
+
+
+@pytest.mark.parametrize("program", ["OpenSfM", "OpenSfM, OpenCV's", "nerfstudio", "Metashape"])
+def test_a_fisheye_projects_as_programs_say(tmp_path, program):
+    """The angle to the axis, in radians, takes the place of its tangent, and is bent."""
+    (tmp_path / "photos").mkdir()
+    cv2.imwrite(str(tmp_path / "photos/00.jpg"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    bent, skewed = dict(FISHEYE), {"p1": 0.0, "p2": 0.0}
+    if program == "Metashape":
+        skewed = {"p1": 2e-3, "p2": -1e-3}
+        given = metashape(tmp_path, LENS | bent | skewed, kind="fisheye")
+    elif program == "nerfstudio":
+        given = nerfstudio(tmp_path)
+        given.write_text(json.dumps(json.loads(given.read_text()) | bent | {"camera_model": "OPENCV_FISHEYE"}))
+    elif program == "OpenSfM":
+        bent = {"k1": -0.05, "k2": 0.01}
+        given = opensfm(tmp_path, "fisheye", bent) / "opensfm/reconstruction.json"
+    else:
+        given = opensfm(tmp_path, "fisheye_opencv", bent) / "opensfm/reconstruction.json"
+    camera = read_posed_photos(given, tmp_path / "photos")[0][0].camera
+    rays = np.random.default_rng(0).uniform(-2, 2, (200, 2))
+    far = np.linalg.norm(rays, axis=1)
+    x, y = (rays / far[:, None] * np.arctan(far)[:, None]).T
+    r2 = x**2 + y**2
+    radial = 1 + sum(bent[f"k{k}"] * r2**k for k in range(1, len(bent) + 1))
+    u = x * radial + skewed["p1"] * (r2 + 2 * x**2) + 2 * skewed["p2"] * x * y
+    v = y * radial + skewed["p2"] * (r2 + 2 * y**2) + 2 * skewed["p1"] * x * y
+    scale = camera.width / WIDTH  # OpenSfM's is for a larger original
+    there = scale * (np.array([WIDTH, HEIGHT]) / 2 + FOCAL * np.stack([u, v], axis=1))
+    np.testing.assert_allclose(camera.img_from_cam(np.column_stack([rays, np.ones(200)])), there, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["simple_radial", "radial", None])
+def test_lenses_of_opensfm_without_some_coefficients_are_read(tmp_path, kind):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/00.jpg").write_bytes(b"")
+    given = opensfm(tmp_path, kind, {"k1": -0.1, "c_x": 0.01}) / "opensfm/reconstruction.json"
+    given.write_text(given.read_text().replace('"projection_type": null, ', ""))
+    camera = read_posed_photos(given, tmp_path / "photos")[0][0].camera
+    pixel = camera.img_from_cam(np.array([[0.3, 0.4, 1.0]]))[0]
+    there = 2 * (np.array([WIDTH, HEIGHT]) / 2 + [0.01 * WIDTH, 0] + FOCAL * (1 - 0.1 * 0.25) * np.array([0.3, 0.4]))
+    assert pixel == pytest.approx(there)
+
+
 def test_wrong_files_of_metashape_and_bundler_are_named(tmp_path):
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -465,6 +510,8 @@ def test_wrong_files_of_metashape_and_bundler_are_named(tmp_path):
         read_posed_photos(path, photos)
     with pytest.raises(StageError, match=r"COLMAP's full OpenCV lens is up to .* px off"):
         read_posed_photos(metashape(tmp_path, LENS | {"b2": -40.0}), photos)
+    with pytest.raises(StageError, match="is a fisheye with b2, p3 or p4"):
+        read_posed_photos(metashape(tmp_path, LENS | {"p3": 0.1}, kind="fisheye"), photos)
     path = metashape(tmp_path)
     for text, message in (
         (path.read_text().replace('sensor id="0" type="frame"', 'sensor id="0" type="spherical"'), "kind spherical"),

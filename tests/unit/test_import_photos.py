@@ -285,8 +285,14 @@ def shrink(file, size):
         (lambda root: (root / "transforms.json").write_text("[]"), "no list of frames"),
         (lambda root: (root / "images/02.png").write_text("no picture"), "images/02.png cannot be decoded"),
         (lambda root: (root / "masks/02.png").unlink(), r"frame 2 .*its mask masks/02.png does not exist"),
-        (lambda root: (root / "masks/02.png").write_text("no picture"), "masks/02.png cannot be read; export it again"),
-        (edit(camera_model="OPENCV_FISHEYE"), "camera model OPENCV_FISHEYE is not read; undistort"),
+        (
+            lambda root: (root / "masks/02.png").write_text("no picture"),
+            "masks/02.png cannot be read; export",
+        ),
+        (edit(camera_model="THIN_PRISM_FISHEYE"), "camera model THIN_PRISM_FISHEYE is not read; undistort"),
+        (edit(camera_model="OPENCV_FISHEYE", fl_x=None, camera_angle_x=1.0), "no focal length; give fl_x"),
+        (edit(w=None, h=None, cx=96.0, cy=64.0), r"principal point, \(96.0, 64.0\), lies outside its 96 x 64 pixels"),
+        (edit(frame_transform_matrix=(np.eye(4) + np.eye(4, k=-3)).tolist()), "last row of transform_matrix is not 0"),
         (edit(frame_camera_model="EQUIRECTANGULAR"), r"frame 0 .*EQUIRECTANGULAR is not read"),
         (edit(k4=0.1), "distortion with k4 is not read"),
         (edit(fl_x=None), "no focal length; give fl_x"),
@@ -306,6 +312,14 @@ def test_bad_input_is_one_sentence(tmp_path, damage, words):
     with pytest.raises(StageError, match=words):
         imported(tmp_path / "in", tmp_path)
     assert not (tmp_path / "undistorted").exists() and not (tmp_path / "masks").exists()
+
+
+def test_a_photo_is_no_mask(tmp_path):
+    data = nerfstudio(tmp_path / "in")
+    grey = np.random.default_rng(0).integers(60, 200, (64, 96, 3)).astype(np.uint8)
+    cv2.imwrite(str(data / "masks/02.png"), grey)
+    with pytest.raises(StageError, match="masks/02.png cannot be read"):
+        imported(data, tmp_path)
 
 
 def test_no_masks_says_what_to_give(tmp_path):

@@ -89,6 +89,9 @@ def colmap_camera(model: str, width: float, height: float, params: Sequence[floa
         raise ValueError(f"a camera has {len(params)} parameters, but {model} has {camera.params_info}")
     if min(camera.params[k] for k in camera.focal_length_idxs()) <= 0:
         raise ValueError("a focal length has to be positive")
+    middle = camera.principal_point_x, camera.principal_point_y
+    if not (0 < middle[0] < width and 0 < middle[1] < height):
+        raise ValueError(f"a principal point, {middle}, lies outside its {width:g} x {height:g} pixels")
     return camera
 
 

@@ -1,13 +1,13 @@
 """Cameras in JSON: transforms.json of nerfstudio and Blender, and reconstruction.json of OpenSfM (OpenDroneMap)."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
+from pycolmap import Camera
 from scipy.spatial.transform import Rotation
 
 from scenefuse.cloud.crs import plane, read_crs
@@ -25,6 +25,10 @@ PLACES = (FILE, f"opensfm/{FILE}")
 TOPOCENTRIC = "reconstruction.topocentric.json"
 # What describes a camera, of a frame or of all of them.
 NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "k4", "p1", "p2")
+FISHEYE = "OPENCV_FISHEYE"
+# OpenSfM's lenses -> whether they are fisheyes; all are special cases of COLMAP's two models.
+LENSES = dict.fromkeys(("perspective", "simple_radial", "radial", "brown"), False)
+LENSES |= dict.fromkeys(("fisheye", "fisheye_opencv"), True)
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
@@ -68,30 +72,34 @@ def _masks(names: list[str], file: Path) -> dict[str, Path]:
     return {name: mask for name, mask in found.items() if named[name] in ("", mask.parent.name.casefold())}
 
 
-def _camera(values: dict[str, Any], where: str) -> Callable[[Path], pycolmap.Camera]:
-    """The lens of a frame for its photo; COLMAP's FULL_OPENCV holds all coefficients that the JSON may have."""
-    model = values.get("camera_model", "OPENCV")
-    if model not in PERSPECTIVE or values.get("is_fisheye"):
-        model = "fisheye" if model in PERSPECTIVE else model
+def _camera(values: dict[str, Any], where: str) -> Callable[[Path], Camera]:
+    """The lens of a frame for its photo; COLMAP's two models hold all coefficients that the JSON may have."""
+    model = FISHEYE if values.get("is_fisheye") else values.get("camera_model", "OPENCV")
+    if model not in (*PERSPECTIVE, FISHEYE):
         raise StageError(f"{where}: the camera model {model} is not read; undistort the photos to PINHOLE first")
     try:
         numbers = {key: float(values[key]) for key in NUMBERS if values.get(key) is not None}
     except (TypeError, ValueError):
         raise StageError(f"{where}: the camera's values have to be numbers; correct them") from None
-    if numbers.get("k4"):
+    if numbers.get("k4") and model != FISHEYE:
         raise StageError(f"{where}: distortion with k4 is not read; undistort the photos to PINHOLE first")
-    if not {"fl_x", "camera_angle_x"} & numbers.keys():
+    if "fl_x" not in numbers and (model == FISHEYE or "camera_angle_x" not in numbers):
         raise StageError(f"{where}: no focal length; give fl_x (pixels) or camera_angle_x (radians)")
 
-    def camera(photo: Path) -> pycolmap.Camera:
+    def camera(photo: Path) -> Camera:
         width, height = (numbers[side] for side in "wh") if {"w", "h"} <= numbers.keys() else stored_size(photo)
         focal = numbers.get("fl_x") or 0.5 * width / np.tan(0.5 * numbers.get("camera_angle_x", 0.0))
         middle = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
-        bent = [numbers.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
-        params = [focal, numbers.get("fl_y", focal), *middle, *bent, 0.0, 0.0, 0.0]
-        return colmap_camera("FULL_OPENCV", width, height, params)
+        return _bent(model == FISHEYE, (width, height), [focal, numbers.get("fl_y", focal), *middle], numbers)
 
     return camera
+
+
+def _bent(fisheye: bool, size: tuple[float, float], straight: list[float], numbers: Mapping[str, float]) -> Camera:
+    """COLMAP's camera of a focal length and middle in x and y, and of coefficients of distortion, 0 where absent."""
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "", "", "")
+    params = [*straight, *(numbers.get(name, 0.0) for name in names)]
+    return colmap_camera(FISHEYE if fisheye else "FULL_OPENCV", *size, params)
 
 
 def _pose(matrix: Any, where: str) -> NDArray[np.float64]:
@@ -102,6 +110,8 @@ def _pose(matrix: Any, where: str) -> NDArray[np.float64]:
         given = np.zeros(0)
     if given.shape not in ((4, 4), (3, 4)) or not np.isfinite(given).all():
         raise StageError(f"{where}: transform_matrix has to be 4 x 4 numbers; export the cameras again")
+    if not np.allclose(given[3:], [0, 0, 0, 1]):
+        raise StageError(f"{where}: the last row of transform_matrix is not 0 0 0 1; rows and columns may be swapped")
     pose = np.eye(4)
     pose[:3] = given[:3]
     pose[:3, :3] = pose[:3, :3] @ FLIP
@@ -114,7 +124,7 @@ def find_opensfm(data: Path) -> Path | None:
 
 
 def read_opensfm(file: Path) -> dict[str, list[GivenCamera]]:
-    """The posed photos of each of the file's reconstructions; lenses perspective and brown.
+    """The posed photos of each of the file's reconstructions.
 
     OpenSfM counts pixels from the middle of the photo, in units of its longer side; a pose is an angle-axis rotation
     and a translation into the camera, whose axes are OpenCV's.
@@ -161,19 +171,14 @@ def opensfm_place(file: Path) -> Place | None:
     return place
 
 
-def _lens(entry: dict[str, Any], where: str) -> pycolmap.Camera:
-    width, height, kind = float(entry["width"]), float(entry["height"]), entry["projection_type"]
+def _lens(entry: dict[str, Any], where: str) -> Camera:
+    width, height, kind = float(entry["width"]), float(entry["height"]), entry.get("projection_type", "perspective")
+    if kind not in LENSES:
+        raise StageError(f"{where} is of the kind {kind}, which is not read; undistort the photos in OpenSfM first")
     size = max(width, height)
-    if kind == "perspective":
-        return colmap_camera(
-            "RADIAL", width, height, [entry["focal"] * size, width / 2, height / 2, entry["k1"], entry["k2"]]
-        )
-    if kind == "brown":
-        focal_x, focal_y = entry["focal_x"] * size, entry["focal_y"] * size
-        middle = width / 2 + entry["c_x"] * size, height / 2 + entry["c_y"] * size
-        bent_by = [entry[key] for key in ("k1", "k2", "p1", "p2", "k3")]
-        return colmap_camera("FULL_OPENCV", width, height, [focal_x, focal_y, *middle, *bent_by, 0.0, 0.0, 0.0])
-    raise StageError(f"{where} is of the kind {kind}; perspective and brown are read")
+    focal = [size * entry[name if name in entry else "focal"] for name in ("focal_x", "focal_y")]
+    middle = width / 2 + size * entry.get("c_x", 0.0), height / 2 + size * entry.get("c_y", 0.0)
+    return _bent(LENSES[kind], (width, height), [*focal, *middle], entry)
 
 
 def _shot_pose(shot: dict[str, Any]) -> np.ndarray:

@@ -25,7 +25,7 @@ MAX_ALTITUDE_M = 40e3
 
 
 def read_metashape(file: Path) -> tuple[list[GivenCamera], list[str]]:
-    """The photos that were aligned, in the active component, and are not disabled, lenses of the kind frame; and a note
+    """The photos that were aligned, in the active component, and are not disabled; and a note
     where there are several chunks.
 
     Args:
@@ -146,8 +146,8 @@ def _outside_from_chunk(chunk: ET.Element) -> Sim3 | None:
 
 def _camera(sensor: ET.Element, where: str) -> pycolmap.Camera:
     kind = sensor.attrib.get("type", "frame")
-    if kind != "frame":
-        raise StageError(f"{where} is of the kind {kind}; frame is read")
+    if kind not in ("frame", "fisheye"):
+        raise StageError(f"{where} is of the kind {kind}; frame and fisheye are read: undistort the photos first")
     of_class = {calibration.attrib.get("class", ""): calibration for calibration in sensor.iterfind("calibration")}
     calibration = of_class.get("adjusted", of_class.get("initial"))
     if calibration is None or calibration.find("f") is None:
@@ -160,8 +160,12 @@ def _camera(sensor: ET.Element, where: str) -> pycolmap.Camera:
     lens = {name: float(calibration.findtext(name, "0")) for name in PARAMETERS}
     focal, middle = [lens["f"] + lens["b1"], lens["f"]], [width / 2 + lens["cx"], height / 2 + lens["cy"]]
     # What Metashape calls P1 is P2 to OpenCV.
-    params = [*focal, *middle, lens["k1"], lens["k2"], lens["p2"], lens["p1"], lens["k3"], 0.0, 0.0, 0.0]
-    camera = colmap_camera("FULL_OPENCV", width, height, params)
+    params = [*focal, *middle, lens["k1"], lens["k2"], lens["p2"], lens["p1"], lens["k3"]]
+    if kind == "fisheye":
+        if any(lens[name] for name in ("b2", "p3", "p4")):
+            raise StageError(f"{where} is a fisheye with b2, p3 or p4; optimize the cameras without, and export again")
+        return colmap_camera("THIN_PRISM_FISHEYE", width, height, [*params, lens["k4"], 0.0, 0.0])
+    camera = colmap_camera("FULL_OPENCV", width, height, [*params, 0.0, 0.0, 0.0])
     if any(lens[name] for name in ("b2", "k4", "p3", "p4")):
         _fit(camera, lens, where)
     return camera
