@@ -38,6 +38,8 @@ UNDECODABLE = (
     *(SyntaxError, MemoryError, struct.error),
 )
 
+# Where servers and systems keep thumbnails and what was deleted.
+SYSTEM_FOLDERS = ("@eadir", "#recycle", "$recycle.bin", "__macosx")
 # Where in a folder other programs keep cameras, and under which names.
 CAMERA_FILES = ["transforms.json", "transforms_train.json", "transforms_test.json"]
 CAMERA_FILES += ["reconstruction.json", "opensfm/reconstruction.json"]
@@ -163,6 +165,16 @@ def masks_by_name(photos: Iterable[str], folder: Path) -> dict[str, Path]:
     return {photo: files[name] for photo, name in found.items()}
 
 
+def masks_among(names: Iterable[str]) -> list[str]:
+    """Those photos (paths below their folder) that are named as masks of others, or lie in a folder of masks and have
+    another's name."""
+    stems = {name: _stem(name.casefold().rpartition("/")[2]) for name in names}
+    of = {name: mask[1] or mask[2] for name, stem in stems.items() if (mask := MASK.fullmatch(stem))}
+    of = {name: stem for name, stem in stems.items() if re.search(r"(^|/)masks?/[^/]*$", name.casefold())} | of
+    photos = {stem for name, stem in stems.items() if name not in of}
+    return [name for name, stem in of.items() if _stem(stem) in photos]
+
+
 def photos_by_name(wanted: Iterable[str], known: Iterable[str], where: str, masks: bool = False) -> dict[str, str]:
     """Which photo is meant by each name that another program, a list or a person gives; those not there are left out.
 
@@ -273,7 +285,7 @@ def open_picture(path: Path) -> Iterator[Image]:
             yield image
     except (*UNDECODABLE, Image.DecompressionBombError) as error:
         why = (
-            "it is no picture"
+            "it is no picture, or of a format that is not read, whatever its ending"
             if isinstance(error, Image.UnidentifiedImageError)
             else str(error) or type(error).__name__
         )
@@ -318,6 +330,6 @@ def _files_below(folder: Path) -> list[Path]:
             folders.clear()
             continue
         entered.add(real)
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        folders[:] = sorted(f for f in folders if not f.startswith(".") and f.casefold() not in SYSTEM_FOLDERS)
         files += [Path(place, name) for name in names if not name.startswith(".")]
     return [file for file in files if file.is_file()]

@@ -13,7 +13,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, value, write_json
-from scenefuse.photos.photo_files import JPEG, geo_file, in_folders, open_picture, photo_files
+from scenefuse.photos.photo_files import JPEG, geo_file, in_folders, masks_among, open_picture, photo_files
 from scenefuse.photos.pictures import JPEG_QUALITY, read_raw, stretched
 from scenefuse.photos.positions import exif_number, exif_text, positions_of, read_geo, stated_position
 
@@ -125,11 +125,14 @@ def photo_names(folder: Path) -> list[str]:
 
 
 def without_copies(folder: Path, names: list[str]) -> tuple[list[str], list[str]]:
-    """Photos of which none is another's file again, byte for byte, and a note that names those left out.
+    """Photos of which none is another's mask, or its file again, byte for byte, and notes that name those left out.
 
     A copy sees nothing that its original does not, but would count as one more photo that confirms it. The shortest
     name stays.
     """
+    masks = masks_among(names)
+    names = [name for name in names if name not in masks]
+    notes = [f"{len(masks)} pictures are masks by their names, and are left out ({masks[0]}, ...)"] if masks else []
     by_size, first_of = dict[int, list[str]](), dict[str, str]()
     for name in sorted(names, key=lambda name: (len(name), name)):
         by_size.setdefault((folder / name).stat().st_size, []).append(name)
@@ -139,11 +142,10 @@ def without_copies(folder: Path, names: list[str]) -> tuple[list[str], list[str]
             first = kept.setdefault(sha256(folder / name), name)
             if first != name:
                 first_of[name] = first
-    if not first_of:
-        return names, []
-    copy = min(first_of)
-    note = f"{len(first_of)} photos are copies of others, byte for byte, and are left out ({copy} of {first_of[copy]})"
-    return [name for name in names if name not in first_of], [note]
+    if first_of:
+        one = f"{(copy := min(first_of))} of {first_of[copy]}"
+        notes.append(f"{len(first_of)} photos are copies of others, byte for byte, and are left out ({one})")
+    return [name for name in names if name not in first_of], notes
 
 
 def orientations_in(content: Mapping[str, Any]) -> dict[str, int]:
@@ -244,6 +246,8 @@ def inspect_photo(folder: Path, name: str) -> Photo:
         equivalent_mm, focal_mm = (
             max(exif_number(taken.get(tag)) or 0.0, 0.0) for tag in (Base.FocalLengthIn35mmFilm, Base.FocalLength)
         )
+        if b"GPano:ProjectionType" in xmp:
+            raise ValueError("it is a panorama, to which no lens is fitted: cut it into views")
         if image.mode in ("F", "I"):
             raise ValueError("its pixels are 32-bit measurements, as a thermal camera's, and no picture")
         sample = _pixels(image, folder / name)[::4, ::4]

@@ -59,7 +59,9 @@ def test_all_bad_photos_are_named_at_once(tmp_path, kind):
     for name in ("b.jpg", "c.jpg"):
         (tmp_path / "p" / name).write_text(f"<html>{name}")
     Image.fromarray(np.ones((9, 9), kind)).save(tmp_path / "p" / "d.tif")
-    with pytest.raises(StageError, match=r"b.jpg cannot be decoded \(it is no picture\).*; nor can c.jpg, d.tif$"):
+    with pytest.raises(
+        StageError, match=r"b.jpg cannot be decoded \(it is no picture, or of a format .*; nor can c.jpg, d.tif$"
+    ):
         listed(tmp_path, tmp_path / "p")
     for name in ("b.jpg", "c.jpg"):
         (tmp_path / "p" / name).unlink()
@@ -138,7 +140,7 @@ def test_missing_and_empty_folders(tmp_path):
         listed(tmp_path, tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "readme.txt").write_text("x")
-    with pytest.raises(StageError, match=r"holds no photos.*1 other files"):
+    with pytest.raises(StageError, match=r"holds no photos.*1 other files were found\)$"):
         listed(tmp_path, tmp_path / "empty")
 
 
@@ -149,7 +151,32 @@ def test_only_what_is_a_photo_is_listed(tmp_path):
     save(folder / ".trash" / "old.jpg")
     for name in (".DS_Store", "Thumbs.db", "._b.JPG", "b.xmp", "b.DNG", "notes.txt"):
         (folder / name).write_bytes(b"x")
+    for name in ("@eaDir/b.JPG/SYNOPHOTO_THUMB_M.jpg", "$RECYCLE.BIN/$R1.jpg", "sub/#recycle/old.jpg"):
+        save(folder / name)
     assert photo_files(folder) == [folder / "b.JPG", folder / "sub" / "a.tif"]
+
+
+@pytest.mark.parametrize(
+    "mask", ["{}_mask.png", "{}.JPG.mask.png", "masks/{}.png", "sub/Mask/{}.jpg", "mask_{}.JPG", "masks/{}_mask.png"]
+)
+def test_masks_among_photos_are_left_out_and_that_is_said(tmp_path, mask):
+    folder = tmp_path / "p"
+    for k, name in enumerate(("IMG_1", "IMG_2", "face_mask", "mask_7")):
+        save(folder / f"{name}.JPG", (40, 30 + k))
+        if k < 2:
+            save(folder / mask.format(name), (40, 50 + k))
+    names = [photo.name for photo in listed(tmp_path, folder)]
+    assert names == ["IMG_1.JPG", "IMG_2.JPG", "face_mask.JPG", "mask_7.JPG"]
+    notes = value(read_json(tmp_path / "photos.json"), "notes")
+    assert any(note.startswith("2 pictures are masks by their names") for note in notes)
+
+
+def test_a_panorama_is_named(tmp_path):
+    kind = b'<x:xmpmeta xmlns:x="adobe:ns:meta/" GPano:ProjectionType="equirectangular"/>'
+    (tmp_path / "p").mkdir()
+    Image.new("RGB", (80, 40)).save(tmp_path / "p" / "a.jpg", xmp=kind)
+    with pytest.raises(StageError, match="a.jpg cannot be decoded .it is a panorama"):
+        listed(tmp_path, tmp_path / "p")
 
 
 def test_photos_in_symlinked_folders_are_found_once(tmp_path):
