@@ -177,6 +177,10 @@ def _clicks(path: Path, kind: Kind, lines: Lines) -> Clicks:
         wanted = {"labels": "click on the object", "points": "mark at least four points on the object"}
         raise StageError(f"{path} holds no points below its header; {wanted.get(kind, 'click both ends of a length')}")
     rows = tuple(_click(path, kind, number, cells) for number, cells in lines)
+    if all(0 <= number <= 1 for click in rows for number in click.pixel):
+        raise StageError(
+            f"{path}: all clicks are within the first pixel; multiply shares by a photo's width and height"
+        )
     # One click marks a point in a photo, and one label a pixel; ends of lengths are checked by `read_ends`.
     marks = [(c.photo, c.pixel.tolist() if kind == "labels" else c.label) for c in rows]
     for click, mark in zip(rows, marks):

@@ -109,6 +109,12 @@ def test_bad_clicks_are_named(tmp_path, model, photos, rows, sentence):
         clicks_per_photo(read(tmp_path, rows), model, photos.views, SIZES)
 
 
+def test_clicks_as_shares_of_width_and_height_are_named(tmp_path):
+    with pytest.raises(StageError, match="all clicks are within the first pixel; multiply shares"):
+        read(tmp_path, [("inside", "f00.png", 0.4, 0.6), ("outside", "f00.png", 0.1, 1)])
+    assert len(read(tmp_path, [("inside", "f00.png", 0.4, 0.6), ("outside", "f00.png", 90, 1)]).rows) == 2
+
+
 def test_labels_are_not_fiducials(tmp_path):
     assert read(tmp_path, [("inside", "f00.png", 5, 5)]).kind == "labels"
     with pytest.raises(StageError, match="holds labels; mark points here"):

@@ -190,6 +190,15 @@ def test_supplied_masks_are_taken_as_they_are_and_strangers_are_an_error(capture
     assert not (tmp_path / "x").exists()
 
 
+def test_masks_that_are_black_on_the_object_are_an_error(capture, tmp_path):
+    supplied = tmp_path / "supplied"
+    shutil.copytree(capture / "truth", supplied)
+    for file in supplied.iterdir():
+        cv2.imwrite(str(file), 255 - cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
+    with pytest.raises(StageError, match="are black on the object; invert them"):
+        run_stage(capture, tmp_path, method="supplied", prompts=None, supplied=supplied)
+
+
 def test_bad_supplied_masks_are_left_out_with_their_reason(capture, tmp_path):
     supplied = tmp_path / "supplied"
     shutil.copytree(capture / "truth", supplied)
