@@ -65,11 +65,11 @@ def object_facts(row: Row) -> dict[str, str]:
         )
         if "measured_share" in has:
             facts["Points"] += f"; {percent(has['measured_share'])} of the object's are confirmed by photos"
-    facts |= _accuracy(has, unit)
+    facts |= {"Accuracy": found[0]} if (found := accuracies(row)) else {}
     if "registered" in has and "frames" in has:
         facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used"
     if "added_points" in has:
-        facts["File"] = f"results/objects/{has['object']}/fused.ply; in the scene: completed.ply"
+        facts["File"] = f"results/objects/{has['object']}/fused.ply, with its surroundings"
     return _capital(facts | _next(has))
 
 
@@ -85,24 +85,26 @@ def surface_facts(folder: Path) -> dict[str, str]:
     found = read_json(folder / "surface.json")
     if value(found, "status") == "empty":
         return {"Mesh": f"None: {value(found, 'reason')}"}
-    shares = ", ".join(
-        f"{percent(value(found, kind))} {kind}" for kind in ("measured", "unconfirmed", "bridged", "open")
-    )
+    shares = ", ".join(f"{percent(value(found, kind))} {what}" for kind, what in WORDS["mesh"].items())
     drawn = is_current(folder / "drawings/drawings.pdf", folder / "surface.json")
     drawings = f", results/objects/{folder.name}/drawings/drawings.pdf" if drawn else ""
     return {"Mesh": f"With the ground around it {shares}; results/objects/{folder.name}/surface.glb{drawings}"}
 
 
-def _accuracy(has: dict[str, Any], unit: str) -> dict[str, str]:
-    parts = [
-        f"{length(has[name], unit)} {where}"
-        for name, where in {"deviation": "on the object", "world_deviation": "in the scene"}.items()
+def accuracies(row: Row) -> list[str]:
+    """How exact a scene or an object is, in sentences; the first is the one to quote."""
+    has = _known(row)
+    found = [
+        f"{length(has[name], has.get('unit', 'scene units'))} {what}"
+        for name, what in WORDS["deviations"].items()
         if name in has
     ]
-    found = [f"standard deviation of a point {' and '.join(parts)}"] if parts else []
     if has.get("scale_sd_log"):
         found.append(f"its size beside the scene's is known to {percent(has['scale_sd_log'])}")
-    return {"Accuracy": "; ".join(found)} if found else {}
+    for kind, what in WORDS["errors"].items():
+        if f"{kind}_rms_horizontal_m" in has and f"{kind}_rms_vertical_m" in has:
+            found += _errors(what, has[f"{kind}_rms_horizontal_m"], has[f"{kind}_rms_vertical_m"])
+    return found
 
 
 def _next(has: dict[str, Any]) -> dict[str, str]:
@@ -144,20 +146,14 @@ def scene_facts(row: Row) -> dict[str, str]:
     else:
         facts["Coordinates"] = "scene units: neither GPS, control points nor known lengths give metres"
     if "ground_pixel" in has:
-        facts["Ground pixel"] = length(has["ground_pixel"], unit)
-    errors = [
-        f"{what} {_errors(has[f'{kind}_rms_horizontal_m'], has[f'{kind}_rms_vertical_m'])}"
-        for kind, what in {"gps": "GPS", "control": "control points", "check": "check points"}.items()
-        if f"{kind}_rms_horizontal_m" in has and f"{kind}_rms_vertical_m" in has
-    ]
-    if errors:
-        facts["Residuals"] = "; ".join(errors)
+        facts["Ground pixel"] = f"{length(has['ground_pixel'], unit)}, what a pixel of a photo covers on the ground"
+    facts |= {"Accuracy": found[0]} if (found := accuracies(row)) else {}
     if "gps_scale_sd_log" in has and "control_rms_horizontal_m" not in has:
         facts["Lengths"] = f"known to {percent(has['gps_scale_sd_log'])} by the photos' GPS"
     if "completed_points" in has:
         file = f"results/scenes/{has['scene']}/completed"
         facts["File"] = f"{file}.copc.laz" + (
-            f" in the CRS; {file}.ply from a local origin" if "crs" in has else f", {file}.ply"
+            f" in these coordinates; {file}.ply from a local origin" if "crs" in has else f", {file}.ply"
         )
     return _capital(facts)
 
@@ -167,12 +163,12 @@ def _capital(facts: dict[str, str]) -> dict[str, str]:
     return {label: text if label == "File" else text[:1].upper() + text[1:] for label, text in facts.items()}
 
 
-def _errors(horizontal_m: float, vertical_m: float) -> str:
+def _errors(what: str, horizontal_m: float, vertical_m: float) -> list[str]:
     """Root mean square errors, and what 90 % of normal errors in the plane and upwards do not exceed."""
     ce90 = length(math.sqrt(math.log(10)) * horizontal_m, "m")
     le90 = length(NormalDist().inv_cdf(0.95) * vertical_m, "m")
-    rms = f"{length(horizontal_m, 'm')} horizontally, {length(vertical_m, 'm')} vertically"
-    return f"{rms} (RMS; CE90 {ce90}, LE90 {le90})"
+    rms = f"{length(horizontal_m, 'm')} horizontally and {length(vertical_m, 'm')} vertically"
+    return [f"{what} {rms} off (root mean square)", f"nine of ten less than {ce90} (CE90) and {le90} (LE90)"]
 
 
 def closing_lines(summary: Path) -> str:

@@ -198,8 +198,8 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     pictures = [(label, render(cloud, camera, sizes, colors)) for label, camera in cameras.items()]
     counts = ", ".join(f"{kind.name.lower().replace('_', ' ')} {(kinds == kind).sum()}" for kind in Lack)
     shown = f", the best {len(toward)} shown" if len(toward) < len(join.stations) else ""
-    note = f"missing cells: {counts} (red, blue, purple); stations: {len(join.stations)}{shown}; see next_photos.csv"
-    sheet = draw_sheet(f"{name}: what is still missing", note, [pictures])
+    note = f"missing cells: {counts} (red, blue, purple)\nstations: {len(join.stations)}{shown}; see next_photos.csv"
+    sheet = draw_sheet(f"{name}: what is still missing", note, [pictures[:2], pictures[2:]])
     axes, middle = sheet.axes[0], from_above.project(join.framed.mean(0, keepdims=True))[0][0]
     for number, place in enumerate(from_above.project(join.stations)[0], 1):
         arrow = {"arrowstyle": "->", "color": "0.5", "shrinkB": 40}

@@ -1,9 +1,8 @@
-"""The report on paper: two A4 pages an object, of the records that the page is made of."""
+"""The report on paper: two A4 pages an object and one a scene, of the records that the page is made of."""
 
 import logging
 from datetime import date
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -36,28 +35,22 @@ def write_pdf(
         {row[kind]: row for row in records(read_table(summary / f"{kind}s.tsv"))} for kind in ("object", "scene")
     )
     page = _Page(title or Path.cwd().name)
+    below = f"{page.project}, {date.fromtimestamp((summary / 'objects.tsv').stat().st_mtime)}"
     for folder in objects:
         name = folder.name
-        page.start(name, f"{page.project}, {date.fromtimestamp((summary / 'objects.tsv').stat().st_mtime)}")
+        page.start(name, below)
         page.facts(object_facts(of_object.get(name, {"object": name, "status": "missing"})) | surface_facts(folder))
         page.pictures([folder / f"figures/{when}.png" for when in ("before", "after")], ["before", "after"])
-        own = [path for path in scenes if len(scenes) == 1 or name in _completed_by(of_scene.get(path.name, {}))]
-        for path in own:
-            if path.name in of_scene:
-                page.heading(f"Scene {path.name}")
-                page.facts(scene_facts(of_scene[path.name]))
-            page.pictures([path / "scene.png"], ["the scene, its cameras and their errors"])
         page.start(name, "from four sides, to one scale")
         if (folder / "drawings/drawings.json").is_file():
             page.sides(folder / "drawings")
         page.pictures([folder / "figures/missing.png"], ["what is missing, and from where photos would show it"])
+    for folder in scenes:
+        page.start(f"Scene {folder.name}", below)
+        page.facts(scene_facts(of_scene.get(folder.name, {"error": "not run yet"})))
+        page.pictures([folder / "scene.png"], ["the scene, its cameras and their errors"])
     with atomic_file(report) as temporary:
         page.output(str(temporary))
-
-
-def _completed_by(row: dict[str, Any]) -> list[str]:
-    """The objects that a scene was completed with."""
-    return str(row.get("completed_by", "")).split(", ")
 
 
 class _Page(FPDF):
@@ -89,12 +82,6 @@ class _Page(FPDF):
         self.cell(0, 6, below, new_x="LMARGIN", new_y="NEXT")
         self.ln(GAP_MM)
 
-    def heading(self, text: str) -> None:
-        """A line above what follows."""
-        self.ln(GAP_MM)
-        self.set_font("sans", "B", 11)
-        self.cell(0, 6, text, new_x="LMARGIN", new_y="NEXT")
-
     def facts(self, facts: dict[str, str]) -> None:
         """A table of labels and sentences."""
         self.set_font("sans", size=9)
@@ -105,6 +92,7 @@ class _Page(FPDF):
             col_widths=(1, 5),
             text_align="LEFT",
             line_height=4.5,
+            padding=0.7,
         ) as table:
             for label, text in facts.items():
                 table.row([label, text])
@@ -119,9 +107,6 @@ class _Page(FPDF):
         width = (self.epw - GAP_MM * (len(shown) - 1)) / len(shown)
         highest = width * max(h / w for w, h in sizes)
         left = self.eph + self.t_margin - self.get_y() - 2 * GAP_MM
-        if left < highest / 4:
-            self.add_page()
-            left = self.eph - 2 * GAP_MM
         width *= min(1.0, left / highest)
         top = self.get_y()
         self.set_font("sans", size=8)

@@ -1,6 +1,7 @@
 """One HTML page of a run that opens anywhere without a network: a card for each object and scene, in a client's words;
 everything scientific is folded away below, for the record."""
 
+import re
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -11,7 +12,7 @@ import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.version import VERSION
-from scenefuse.report.facts import WORDS, object_facts, scene_facts, surface_facts
+from scenefuse.report.facts import WORDS, accuracies, object_facts, scene_facts, surface_facts
 from scenefuse.report.page import document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
 from scenefuse.report.values import asset, number, read_table, records
@@ -63,6 +64,7 @@ def write_report(
     )
     rows = [of_object.get(folder.name, {"object": folder.name, "status": "missing"}) for folder in objects]
     shown = list(zip(objects, rows))
+    exact = {name: accuracies(row) for name, row in (of_scene | of_object).items()}
     links = "".join(f'<a href="#{escape(folder.name)}">{escape(folder.name)}</a>' for folder in objects)
     body = [
         f"<header><h1>{escape(title)}</h1><p>{texts['intro']} Made by scenefuse {VERSION}.</p>",
@@ -75,6 +77,7 @@ def write_report(
         *(_object_card(folder, row, views.get(folder / "figures"), texts) for folder, row in shown),
         *(_scene_card(folder, views.get(folder), texts) for folder in scenes if (folder / "scene.png").is_file()),
         '<section id="record"><h2>For the record</h2>',
+        _folded("Accuracy", _facts({name: "; ".join(found) for name, found in exact.items() if found}), "accuracy"),
         *(_object_record(folder, texts) for folder, row in shown if row["status"] not in UNFINISHED),
         *([] if paper is None else [_folded("The paper", _paper_section(paper), "compared")]),
         *(_table_section(name, table, **texts["tables"][name]) for name, table in tables.items()),
@@ -100,7 +103,9 @@ def _views(folders: list[Path]) -> dict[Path, View]:
 
 
 def _facts(facts: dict[str, str]) -> str:
-    return f"<dl>{''.join(f'<div><dt>{k}</dt><dd>{escape(text)}</dd></div>' for k, text in facts.items())}</dl>"
+    """Labels and sentences; files of the results are links from results/summary/, where the page is."""
+    linked = {k: re.sub(r"results/([\w./-]*\w)", r'<a href="../\1">\g<0></a>', escape(v)) for k, v in facts.items()}
+    return f"<dl>{''.join(f'<div><dt>{k}</dt><dd>{text}</dd></div>' for k, text in linked.items())}</dl>"
 
 
 def _folded(title: str, content: str, key: str) -> str:

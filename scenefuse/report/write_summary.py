@@ -15,7 +15,15 @@ import yaml
 from scenefuse.core.stage import atomic_file
 from scenefuse.core.version import VERSION
 from scenefuse.metrics.completion import MEASURES
-from scenefuse.report.facts import diagnose, ground_pixel, is_current, object_facts, photographed, scene_facts
+from scenefuse.report.facts import (
+    accuracies,
+    diagnose,
+    ground_pixel,
+    is_current,
+    object_facts,
+    photographed,
+    scene_facts,
+)
 from scenefuse.report.forecast import FORECAST, read_forecast
 from scenefuse.report.run_summary import ObjectSummary, RunInputs, RunSummary, SceneSummary, summarise, why_missing
 from scenefuse.report.values import Fields, asset, find, number, parts_of, records, unit_of
@@ -226,11 +234,12 @@ def details_text(run: RunSummary, tables: dict[str, pd.DataFrame]) -> str:
     details, lines, first = QUANTITIES["details"], list[str](), run.variants[0]
     for scene, row in zip(run.scenes, records(tables["scenes"])):
         lines += _heading(f"scene {scene.name}") + _fact_lines(scene_facts(row))
+        lines += _line("accuracies", "; ".join(accuracies(row)))
         lines += [] if scene.missing else _detail_lines(details["scene"], scene.fields)
     for item, row in zip(run.objects, records(tables["objects"])):
         fields = item.stages | item.variants[first] | item.fusion
         lines += _heading(f"object {item.name}: {row['status']}") + _fact_lines(object_facts(row))
-        lines += _line("missing", item.missing)
+        lines += _line("accuracies", "; ".join(accuracies(row))) + _line("missing", item.missing)
         others = (f"{variant} {item.status(variant)}" for variant in run.variants[1:])
         lines += _line("variants", ", ".join(others) if find(fields, "fine.status") else "")
         lines += _detail_lines(details["object"], fields)

@@ -334,14 +334,14 @@ def test_a_phone_shows_turns_and_measures_without_scrolling_sideways(page):
 # A client's questions, and what answers each.
 QUESTIONS = {
     "how large is it?": r"11\.4 m × 10\.1 m, 7\.85 m high",
-    "how exact?": r"standard deviation of a point 6\.92 mm on the object",
+    "how exact?": r"12\.9 mm in the scene, the standard deviation of a point",
     "what is missing?": r"2\.0 % is missing: 0\.9 % seen by no photo",
     "which CRS?": r"UTM zone 32N \(EPSG:25832\)",
     "when?": "2024-06-01",
     "how many photos?": "40 of 40 used",
-    "may I trust the scale?": r"its size beside the scene's is known to 0\.1 %",
+    "may I trust the scale?": r"known to 0\.2 % by the photos' GPS",
     "where is the file?": r"objects/house/fused\.ply",
-    "what next?": r"photograph it from 4 places \(results/objects/house/next_photos\.csv\)",
+    "what next?": "photograph it from 4 places",
     "who made it?": r"Made by scenefuse \d",
 }
 SHOWN = """
@@ -362,7 +362,7 @@ def test_a_clients_questions_are_answered_by_the_first_screens(tmp_path, phone, 
     page = report(tmp_path, {"house": None})
     rows = {
         "scenes": "scene=yard length_unit=m points=900 completed_points=1000 completed_by=house crs=EPSG:25832"
-        " photographed=2024-06-01 photos=60 registered=60",
+        " photographed=2024-06-01 photos=60 registered=60 gps_scale_sd_log=0.002",
         "objects": "object=house scene=yard status=registered unit=m length=11.4 width=10.1 height=7.85"
         " surface_missing=0.02 surface_never_seen=0.009 deviation=0.00692 world_deviation=0.0129"
         " scale_sd_log=0.001 registered=40 frames=40 added_points=75 stations=4 stations_show=0.7",

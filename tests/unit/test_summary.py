@@ -467,17 +467,20 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
     text = (results / "summary/summary.txt").read_text()
     assert len(text.splitlines()) < 45 and max(map(len, text.splitlines())) <= 100
     card = page.split('id="house"')[1].split("<section")[0]
+    assert '<a href="../objects/house/next_photos.csv">results/objects/house/next_photos.csv</a>' in card
+    card = re.sub("<.+?>", "", card)
     for sentence in (
         "11.4 m × 9.96 m, 8.10 m high",
         "98.2 % is there, 1.8 % is missing: 1.0 % seen by no photo, 0.8 % where photos disagree;"
         " of the ground at its foot 1.2 % is missing",
-        "Standard deviation of a point 7.20 mm on the object and 13.1 mm in the scene",
+        "13.1 mm in the scene, the standard deviation of a point (two of three points are nearer)",
         "Photograph it from 3 places (results/objects/house/next_photos.csv): this would show 77 % of what no photo",
     ):
         assert sentence in " ".join(text.split()) and sentence in card, sentence
     assert "Not added to the scene: weak. Perhaps it is not in this scene" in text
     above, record = page.split('id="record"')
     assert "<table" not in above and "surface_" in record and "<table" in record
+    assert "7.20 mm on the object by itself" not in above and "7.20 mm on the object by itself" in record
 
 
 def test_the_scene_says_where_when_and_how_exactly_it_was_photographed(results):
@@ -505,7 +508,8 @@ def test_the_scene_says_where_when_and_how_exactly_it_was_photographed(results):
     assert "47.49996° N, 8.50000° W" in text and "2024-06-01, 59 of 60 photos used" in text
     assert "Metres, WGS 84 / UTM zone 32N (EPSG:32632)" in text and "Ground pixel 40.0 mm" in text
     # Of normal errors, 90 % stay below 1.517 RMS in the plane and 1.645 RMS upwards.
-    assert "Check points 20.0 mm horizontally, 40.0 mm vertically (RMS; CE90 30.3 mm, LE90 65.8 mm)" in text
+    assert "Check points are 20.0 mm horizontally and 40.0 mm vertically off (root mean square)" in text
+    assert "nine of ten less than 30.3 mm (CE90) and 65.8 mm (LE90)" in text
 
 
 def test_a_run_ends_in_three_lines(results):

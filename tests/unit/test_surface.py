@@ -481,7 +481,7 @@ def test_the_report_says_of_a_surface_how_much_is_measured(closed, tmp_path: Pat
     (tmp_path / "fused.ply").touch()
     write_json(tmp_path / "surface.json", surface_report(closed, "m") | {"reason": quantity("", "")})
     found = surface_facts(tmp_path)["Mesh"]
-    assert "% measured" in found and "% open" in found and found.endswith(f"objects/{tmp_path.name}/surface.glb")
+    assert "% measured" in found and "% left open" in found and found.endswith(f"objects/{tmp_path.name}/surface.glb")
     pdf, made = tmp_path / "drawings/drawings.pdf", (tmp_path / "surface.json").stat().st_mtime
     pdf.parent.mkdir()
     pdf.touch()
@@ -490,7 +490,7 @@ def test_the_report_says_of_a_surface_how_much_is_measured(closed, tmp_path: Pat
         assert ("drawings.pdf" in surface_facts(tmp_path)["Mesh"]) == listed
 
 
-def test_an_object_has_two_pages_on_paper_with_its_sides_to_one_scale(coarse, tmp_path: Path):
+def test_an_object_has_two_pages_on_paper_with_its_sides_to_one_scale_and_its_scene_one(coarse, tmp_path: Path):
     shed, summary = tmp_path / "objects/shed", tmp_path / "summary"
     (shed / "figures").mkdir(parents=True)
     summary.mkdir()
@@ -511,9 +511,9 @@ def test_an_object_has_two_pages_on_paper_with_its_sides_to_one_scale(coarse, tm
         report=tmp_path / "r.pdf",
     )
     pages = [page.get_textpage().get_text_bounded() for page in pypdfium2.PdfDocument(tmp_path / "r.pdf")]
-    assert len(pages) == 2
-    for word in ("Hof Müller", "11.4 m × 10.0 m, 8.10 m high", "ETRS89 / UTM zone 32N (EPSG:25832)"):
-        assert word in pages[0]
+    assert len(pages) == 3
+    assert "Hof Müller" in pages[0] and "11.4 m × 10.0 m, 8.10 m high" in pages[0]
+    assert "Scene yard" in pages[2] and "ETRS89 / UTM zone 32N (EPSG:25832)" in pages[2]
     assert "from the north" in pages[1] and "1.00 scene units" in pages[1]
 
 

@@ -239,7 +239,7 @@ rule write_report:
 
 
 rule write_pdf:
-    """The same on paper, two pages an object; `scenefuse export` asks for it."""
+    """The same on paper; `scenefuse export` asks for it."""
     input:
         summary="results/summary/summary.txt",
         scenes=expand("results/scenes/{scene}/scene.png", scene=SCENES),

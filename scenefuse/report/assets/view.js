@@ -131,6 +131,9 @@ class View {
     this.picked = [];
     this.camera = null;
     this.plot = null;
+    // Until the view is drawn, a picture of the page stands in its place.
+    const picture = section.parentElement.querySelector(".after img, .sheet img");
+    if (picture) this.stage.prepend(Object.assign(picture.cloneNode(), { className: "poster" }));
     this.listen();
   }
 
