@@ -239,7 +239,7 @@ def precision_note(path: Path, points: NDArray[np.float64], step: float) -> list
     """What to say of coordinates in single precision, whose steps are not small beside the spacing `step`."""
     farthest = float(np.abs(points).max(initial=0))
     coarse = float(np.spacing(np.float32(farthest)))
-    if coarse < MAX_STEP * step or not (points == points.astype(np.float32)).all():
+    if not step or coarse < MAX_STEP * step or not (points == points.astype(np.float32)).all():
         return []
     return [
         f"{path.name} has coordinates up to {farthest:.6g} in single precision, which knows them in steps of"

@@ -291,6 +291,16 @@ def test_colours_of_e57_have_the_scan_s_limits(tmp_path, low, high):
     assert reds(read_cloud(tmp_path / "a.e57")) == np.rint(255 * share).tolist()
 
 
+def test_points_of_e57_that_a_flag_says_have_no_colours_are_counted(tmp_path, capsys):
+    colors = dict(zip(("colorRed", "colorGreen", "colorBlue"), np.array(COLORS).T / 255))
+    flagged = {"isColorInvalid": np.arange(40) < 7}
+    e57(tmp_path / "a.e57", dict(zip(AXES, np.array(GRID).T)) | colors | flagged, real)
+    assert len(read_cloud(tmp_path / "a.e57").colors) == 40
+    assert "7 points of a scan have no colours" in capsys.readouterr().out
+    e57(tmp_path / "b.e57", dict(zip(AXES, np.array(GRID).T)) | flagged, real)
+    assert read_cloud(tmp_path / "b.e57").colors is None and capsys.readouterr().out == ""
+
+
 def test_scaled_integers_of_e57_are_scaled(tmp_path):
     def node(image, name):
         return libe57.ScaledIntegerNode(image, 0, -(10**9), 10**9, 0.001, 0.0)

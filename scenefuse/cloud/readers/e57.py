@@ -41,7 +41,8 @@ def _scan(file: Any, header: Any, colored: bool, measured: bool, at_once: int) -
     color = ("colorRed", "colorGreen", "colorBlue") if colored else ()
     states = ("cartesianInvalidState", "sphericalInvalidState")
     more = ("intensity",) if measured else ()
-    wanted = [name for name in (*cartesian, *spherical, *color, *more, *states) if name in header.point_fields]
+    flag, unpainted = "isColorInvalid" if colored else "", 0
+    wanted = [name for name in (*cartesian, *spherical, *color, *more, *states, flag) if name in header.point_fields]
     limits = [_limits(header, name) for name in color]
     buffer = {name: np.empty(min(header.point_count, at_once)) for name in wanted}
     buffers = libe57.VectorSourceDestBuffer()
@@ -64,7 +65,10 @@ def _scan(file: Any, header: Any, colored: bool, measured: bool, at_once: int) -
             found[name] = (
                 share.astype(np.float32) if high == 1 else np.clip(np.rint(255 * share), 0, 255).astype(np.uint8)
             )
+        unpainted += int(np.count_nonzero(columns.get(flag, 0)))
         yield found | {name: columns[name].astype(np.float32) for name in more}
+    if unpainted:
+        print(f"note: {unpainted} points of a scan have no colours, and those that the file has for them are used")
 
 
 def _limits(header: Any, name: str) -> tuple[float, float]:
