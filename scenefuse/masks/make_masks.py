@@ -196,17 +196,13 @@ def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Worksp
     if inputs.supplied is None:
         raise StageError("method supplied needs a folder of masks; set its path in config/objects.tsv")
     found, unusable = supplied_masks(inputs.supplied, inputs.sparse, photos.views)
-    if np.mean([_is_hole(mask) for mask in found.values()]) > 0.5:
+    # Their whole border is white, and their middle is not.
+    holes = [m[[0, -1]].all() and m[:, [0, -1]].all() and not m[len(m) // 2, m.shape[1] // 2] for m in found.values()]
+    if 2 * sum(map(bool, holes)) > len(holes):
         raise StageError(f"the masks in {inputs.supplied} are black on the object; invert them: it has to be white")
     missing = {view.name: "no mask was supplied" for view in photos.views if view.name not in found}
     photos = photos.subset([k for k, view in enumerate(photos.views) if view.name in found])
     return [found[view.name] for view in photos.views], photos, missing | unusable
-
-
-def _is_hole(mask: Mask) -> bool:
-    """Whether the whole border of a mask (H, W) is on the object, and its middle is not."""
-    border = [mask[0], mask[-1], mask[:, 0], mask[:, -1]]
-    return bool(np.concatenate(border).all()) and not mask[mask.shape[0] // 2, mask.shape[1] // 2]
 
 
 def _kept(made: ScoredMasks, keep: str, sparse: Path, views: list[View]) -> ScoredMasks:

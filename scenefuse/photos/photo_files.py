@@ -104,8 +104,8 @@ def bundler_list(file: Path) -> Path | None:
 def photo_files(folder: Path) -> list[Path]:
     """The photos below a folder, symlinked folders included, sorted by their names relative to it.
 
-    Hidden files and folders and files that are no photos are left out; so are raw files and HEIC where the same photo
-    lies beside them in a readable format.
+    Hidden files and folders and files that are no photos are left out; so are those that belong to photos
+    (`beside_photos`), and raw files and HEIC where the same photo lies beside them in a readable format.
 
     Raises:
         StageError: the folder is missing or holds no photo, or a photo has a format that cannot be read.
@@ -128,7 +128,8 @@ def photo_files(folder: Path) -> list[Path]:
         found = f"{len(files)} other files were found"
         found = f"as an object, give the video itself: {video}" if video else found
         raise StageError(f"the photo folder {folder} holds no photos; put JPEG, PNG, TIFF or BMP files there ({found})")
-    return sorted(photos, key=lambda file: file.relative_to(folder).as_posix())
+    beside = {folder / name for name in beside_photos(folder)}
+    return sorted({*photos} - beside, key=lambda file: file.relative_to(folder).as_posix())
 
 
 def geo_file(folder: Path) -> Path | None:
@@ -165,14 +166,16 @@ def masks_by_name(photos: Iterable[str], folder: Path) -> dict[str, Path]:
     return {photo: files[name] for photo, name in found.items()}
 
 
-def masks_among(names: Iterable[str]) -> list[str]:
-    """Those photos (paths below their folder) that are named as masks of others, or lie in a folder of masks and have
-    another's name."""
-    stems = {name: _stem(name.casefold().rpartition("/")[2]) for name in names}
+def beside_photos(folder: Path) -> list[str]:
+    """Pictures below a folder of photos (paths relative to it) that belong to others by their names: masks, pictures in
+    a folder of masks, and those that lie beside the same photo as JPEG."""
+    stems = {name: _stem(name.casefold().rpartition("/")[2]) for name in pictures_below(folder)}
+    jpegs = {name.rpartition(".")[0] for name in stems if name.lower().endswith(JPEG)}
+    again = [name for name in stems if not name.lower().endswith(JPEG) and name.rpartition(".")[0] in jpegs]
     of = {name: mask[1] or mask[2] for name, stem in stems.items() if (mask := MASK.fullmatch(stem))}
     of = {name: stem for name, stem in stems.items() if re.search(r"(^|/)masks?/[^/]*$", name.casefold())} | of
     photos = {stem for name, stem in stems.items() if name not in of}
-    return [name for name, stem in of.items() if _stem(stem) in photos]
+    return sorted({*again, *(name for name, stem in of.items() if _stem(stem) in photos)})
 
 
 def photos_by_name(wanted: Iterable[str], known: Iterable[str], where: str, masks: bool = False) -> dict[str, str]:

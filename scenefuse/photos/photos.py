@@ -13,7 +13,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, value, write_json
-from scenefuse.photos.photo_files import JPEG, geo_file, in_folders, masks_among, open_picture, photo_files
+from scenefuse.photos.photo_files import JPEG, beside_photos, geo_file, in_folders, open_picture, photo_files
 from scenefuse.photos.pictures import JPEG_QUALITY, read_raw, stretched
 from scenefuse.photos.positions import exif_number, exif_text, positions_of, read_geo, stated_position
 
@@ -125,14 +125,14 @@ def photo_names(folder: Path) -> list[str]:
 
 
 def without_copies(folder: Path, names: list[str]) -> tuple[list[str], list[str]]:
-    """Photos of which none is another's mask, or its file again, byte for byte, and notes that name those left out.
+    """Photos of which none is another's file again, byte for byte, and notes that name pictures that were left out.
 
     A copy sees nothing that its original does not, but would count as one more photo that confirms it. The shortest
     name stays.
     """
-    masks = masks_among(names)
-    names = [name for name in names if name not in masks]
-    notes = [f"{len(masks)} pictures are masks by their names, and are left out ({masks[0]}, ...)"] if masks else []
+    beside = beside_photos(folder)
+    of = "masks of photos by their names, or these photos in another format"
+    notes = [f"{len(beside)} pictures are {of}, and are left out ({beside[0]}, ...)"] if beside else []
     by_size, first_of = dict[int, list[str]](), dict[str, str]()
     for name in sorted(names, key=lambda name: (len(name), name)):
         by_size.setdefault((folder / name).stat().st_size, []).append(name)

@@ -132,6 +132,6 @@ def test_too_few_frames_leave_nothing_behind(tmp_path):
 
 def test_frames_that_would_share_a_mask(tmp_path):
     folder = folder_of(tmp_path, [(64, 48)] * 3)
-    Image.fromarray(picture()).save(folder / "00.jpg")
-    with pytest.raises(StageError, match=r"00\.jpg and 00\.png in .* would share the mask 00\.png"):
+    Image.fromarray(picture()).save(folder / "00.bmp")
+    with pytest.raises(StageError, match=r"00\.bmp and 00\.png in .* would share the mask 00\.png"):
         extract(tmp_path, folder)

@@ -157,7 +157,8 @@ def test_only_what_is_a_photo_is_listed(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "mask", ["{}_mask.png", "{}.JPG.mask.png", "masks/{}.png", "sub/Mask/{}.jpg", "mask_{}.JPG", "masks/{}_mask.png"]
+    "mask",
+    ["{}_mask.png", "{}.tif", "{}.JPG.mask.png", "masks/{}.png", "sub/Mask/{}.jpg", "mask_{}.JPG", "masks/{}_mask.png"],
 )
 def test_masks_among_photos_are_left_out_and_that_is_said(tmp_path, mask):
     folder = tmp_path / "p"
@@ -168,7 +169,7 @@ def test_masks_among_photos_are_left_out_and_that_is_said(tmp_path, mask):
     names = [photo.name for photo in listed(tmp_path, folder)]
     assert names == ["IMG_1.JPG", "IMG_2.JPG", "face_mask.JPG", "mask_7.JPG"]
     notes = value(read_json(tmp_path / "photos.json"), "notes")
-    assert any(note.startswith("2 pictures are masks by their names") for note in notes)
+    assert any(note.startswith("2 pictures are masks of photos by their names, or") for note in notes)
 
 
 def test_a_panorama_is_named(tmp_path):
