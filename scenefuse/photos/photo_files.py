@@ -48,7 +48,7 @@ BUNDLER = ".out"
 # Where in an OpenDroneMap project its place on the earth is.
 COORDS = "odm_georeferencing/coords.txt"
 # What the name of a mask may have more than its photo's: a_mask, a.jpg.mask, a-mask, mask_a.
-MASK = re.compile(r"(.+?)(?:[_.-]mask)+|mask[_.-](.+)", re.DOTALL)
+MASK = re.compile(r"(.+?)(?:[_. -]mask)+|mask[_. -](.+)", re.DOTALL)
 # What to do about names that do not tell photos apart.
 RENAME = "give the folder that holds the photos alone, or every photo a name of its own"
 

@@ -188,7 +188,11 @@ def save_upright(folder: Path, photo: Photo, target: Path, bits: int = 0, max_wi
         if max_width_px is not None and width > max_width_px:
             size = max_width_px, max(round(height * max_width_px / width), 1)
             upright = upright.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
-        coded: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if target.suffix.lower() in JPEG else {}
+        # libtiff, which compresses, does not write this EXIF; a PNG may be called JPEG.
+        coded: dict[str, Any] = {"compression": "raw"}
+        if target.suffix.lower() in JPEG:
+            upright = upright if upright.mode in ("L", "RGB", "CMYK") else upright.convert("RGB")
+            coded = {"quality": JPEG_QUALITY, "subsampling": 0}
         upright.save(target, exif=exif.tobytes(), **coded)
     focal_px = photo.focal_px and photo.focal_px * max(upright.size) / max(width, height)
     seen: dict[str, Any] = {"width": upright.width, "height": upright.height, "sha256": sha256(target)}

@@ -77,6 +77,7 @@ def test_a_photo_that_is_gone_is_not_taken_from_another_folder():
         "Mask_b.png",
         "b_mask.JPG.png",
         "b_mask_mask.png",
+        "b mask.png",
         "x/b.jpe",
     ],
 )

@@ -172,6 +172,37 @@ def test_masks_among_photos_are_left_out_and_that_is_said(tmp_path, mask):
     assert any(note.startswith("2 pictures are masks of photos by their names, or") for note in notes)
 
 
+@pytest.mark.parametrize("focal_35mm", [None, 24])
+@pytest.mark.parametrize(
+    ("name", "mode", "kind", "more"),
+    [
+        ("a.tif", "RGB", "TIFF", {"compression": "tiff_lzw"}),
+        ("a.tif", "L", "TIFF", {"compression": "tiff_adobe_deflate"}),
+        ("a.tif", "I;16", "TIFF", {"compression": "tiff_lzw"}),
+        ("a.tif", "CMYK", "TIFF", {}),
+        ("a.jpg", "CMYK", "JPEG", {}),
+        ("a.jpg", "RGBA", "PNG", {}),
+        ("a.jpg", "P", "PNG", {}),
+        ("a.jpg", "RGB", "WEBP", {}),
+        ("a.png", "LA", "PNG", {}),
+    ],
+)
+def test_photos_of_all_modes_are_turned_and_made_smaller(tmp_path, name, mode, kind, more, focal_35mm):
+    bright = np.full((30, 80), 200, np.uint8)
+    picture = Image.fromarray(bright.astype(np.uint16) * 257) if mode == "I;16" else Image.fromarray(bright)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    if focal_35mm and not more:  # Pillow writes no such EXIF into a compressed TIFF
+        exif[0x8769] = {0xA405: focal_35mm}
+    (tmp_path / "p").mkdir()
+    picture = picture if mode in ("I;16", "L") else picture.convert("RGB").convert(mode)
+    picture.save(tmp_path / "p" / name, kind, exif=exif.tobytes(), **more)
+    found = save_upright(tmp_path / "p", inspect_photo(tmp_path / "p", name), tmp_path / name, max_width_px=15)
+    assert (found.width, found.height) == (15, 40) and inspect_photo(tmp_path, name).orientation == 1
+    assert read_rgb(tmp_path / name).mean() == pytest.approx(200, abs=3)
+    assert pycolmap.Bitmap.read(tmp_path / name, True).width == 15
+
+
 def test_a_panorama_is_named(tmp_path):
     kind = b'<x:xmpmeta xmlns:x="adobe:ns:meta/" GPano:ProjectionType="equirectangular"/>'
     (tmp_path / "p").mkdir()
