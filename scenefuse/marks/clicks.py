@@ -177,7 +177,7 @@ def _clicks(path: Path, kind: Kind, lines: Lines) -> Clicks:
         wanted = {"labels": "click on the object", "points": "mark at least four points on the object"}
         raise StageError(f"{path} holds no points below its header; {wanted.get(kind, 'click both ends of a length')}")
     rows = tuple(_click(path, kind, number, cells) for number, cells in lines)
-    if all(0 <= number <= 1 for click in rows for number in click.pixel):
+    if all(0 <= number < 1 for click in rows for number in click.pixel):
         raise StageError(
             f"{path}: all clicks are within the first pixel; multiply shares by a photo's width and height"
         )

@@ -111,7 +111,7 @@ def test_bad_clicks_are_named(tmp_path, model, photos, rows, sentence):
 
 def test_clicks_as_shares_of_width_and_height_are_named(tmp_path):
     with pytest.raises(StageError, match="all clicks are within the first pixel; multiply shares"):
-        read(tmp_path, [("inside", "f00.png", 0.4, 0.6), ("outside", "f00.png", 0.1, 1)])
+        read(tmp_path, [("inside", "f00.png", 0.4, 0.6), ("outside", "f00.png", 0.1, 0.9)])
     assert len(read(tmp_path, [("inside", "f00.png", 0.4, 0.6), ("outside", "f00.png", 90, 1)]).rows) == 2
 
 
