@@ -173,6 +173,8 @@ def check_in_area(crs: pyproj.CRS, points: Array, where: str, beyond_deg: float 
         row = int(np.flatnonzero(strange)[0])
         swapped = _in_area(crs, _in_degrees(crs, points[:, 1::-1]), beyond_deg).all()
         advice = "x and y are swapped: x is easting or longitude" if swapped else "correct the CRS or the coordinates"
+        if (zone := plane(crs).utm_zone) and (points[:, 0] // 1e6 == int(zone[:-1])).all():
+            advice = f"x begins with the zone: take {zone[:-1]} off, or name a CRS whose eastings have it, as EPSG:4647"
         raise StageError(
             f"{where}: {points[row, 0]:.12g} {points[row, 1]:.12g} does not lie in {crs.name}"
             f" ({strange.sum()} of {len(points)} points); {advice}"
@@ -188,8 +190,8 @@ def _in_degrees(crs: pyproj.CRS, points: Array) -> Array:
 
 def _in_area(crs: pyproj.CRS, degrees: Array, beyond_deg: float) -> np.ndarray:
     """(N,) whether longitude, latitude exist and lie in the area of the CRS or near it."""
-    longitude, latitude = degrees.T
-    good = np.isfinite(degrees).all(1) & (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360)
+    longitude, latitude = np.where(np.isfinite(degrees), degrees, 1e9).T
+    good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360)
     area = plane(crs).area_of_use
     if area is None:
         return good

@@ -374,6 +374,8 @@ def test_a_geo_file_takes_the_place_of_exif(tmp_path, capsys, name):
         ("EPSG:4326\na.jpg 8.5 47.4\na.jpg 8.5 47.4\n", "given more than once"),
         ("EPSG:4326\nq.jpg 8.5 47.4\n", "names none of the photos"),
         ("EPSG:25832\na.jpg 5246000 466000\n", "x and y are swapped"),
+        ("EPSG:25832\na.jpg 32466000 5246000\n", "x begins with the zone: take 32 off, or name a CRS"),
+        ("EPSG:25832\na.jpg 3466000 5246000\n", "correct the CRS or the coordinates"),
         ("EPSG:25832\n", "holds no positions"),
     ],
 )
