@@ -32,7 +32,7 @@ Content = dict[str, Any]
 class DepthTrainingSettings:
     """How stage 1 trains."""
 
-    epochs: int = setting(15, least=0)
+    epochs: int = setting(5, least=0)
     """Epochs of training, each over all photos."""
     crop_px: int = 144
     """The network sees photos cut to the object, about this many pixels squared."""

@@ -32,7 +32,7 @@ MAP_READERS = {
 }
 MASK_S = {"sam2": 13.0, "grabcut": 0.9}
 # A photo in an epoch of the depth network; a ray.
-DEPTH_NETWORK_S, RAY_S = 0.09, 5.5e-5
+DEPTH_NETWORK_S, RAY_S = 0.13, 5.5e-5
 # The clock's time, over processor seconds shared by all cores: jobs that wait for each other leave some idle.
 IDLE_FACTOR = 1.15
 # A forecast is right within this factor: what is short by more cannot do.
