@@ -142,7 +142,7 @@ class SidePanel:
     def show_note(self, layers: MaskLayers) -> None:
         """Say what makes the mask, and what is wrong with it."""
         segmenter = self._session.segmenter
-        method = f"Mask by {segmenter.method}." if segmenter.method else segmenter.loading
+        method = f"The mask (green) is made by {segmenter.method}." if segmenter.method else segmenter.loading
         self._note.set_text(f"{method} {layers.note}")
 
     def _toggle(self, choices: dict, value: str, choose: Callable) -> None:
@@ -190,7 +190,8 @@ class SidePanel:
     def _fill_next(self, editor: Editor) -> None:
         table, document = editor.table, editor.table.document
         ui.label("What comes next").classes("text-sm font-bold")
-        for problem in table.problems()[:6]:
+        problems = table.problems()[:6]
+        for problem in problems:
             ui.label(problem).classes("text-xs text-orange-900")
         if any(row.photo not in table.pictures for row in document.rows):
             remove = ui.button("Remove clicks in missing photos", on_click=lambda: self._act(editor.remove_lost))
@@ -198,6 +199,7 @@ class SidePanel:
         if document.rows and not table.listed:
             text = f"Write {document.path} into the column {table.column} of the table of {table.of}."
             ui.label(text).classes("text-xs text-orange-900")
-        ui.button("Done", on_click=self._on_done).props("dense unelevated").classes("w-full")
+        done = ui.button("Done", on_click=self._on_done).classes("w-full")
+        done.props("dense outline" if problems else "dense unelevated")
         ui.label("Then scenefuse complete goes on by itself; by hand, in the project's folder:").classes("text-xs")
         ui.label(next_command(self._session.configfiles, table.result)).classes("code w-full").mark("command")

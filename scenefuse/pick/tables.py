@@ -32,7 +32,7 @@ LENGTH = "Write the name and the metres of a length that you know, and click its
 # What to do, by the column that names the table and its kind.
 ADVICE: dict[tuple[str, Kind], str] = {
     ("prompts", "labels"): "Click each part of the object in one photo, about five times. Where the mask holds more,"
-    " click there as outside.",
+    " click there as outside. Once it holds the object, press Done: the other tables are seldom needed.",
     ("prompts", "points"): "Mark at least four points on the object that span it, each in two or more photos.",
     ("fiducials", "labels"): f"{FEW_FEATURES}Click the object's ends, top and foot in one photo, and what it touches as"
     " outside.",
