@@ -107,6 +107,7 @@ def test_rows_whose_number_is_missing_are_left_out_and_counted(tmp_path, missing
         ("a.xyz", "\n".join([*rows()[:-1], "1 2"]), "a.xyz is cut short: it ends within a row, line 40; copy it again"),
         ("a.xyz", "\n".join(["1 2 3 4", *rows()]), "line 2, has 3 columns, the first row 4: .*; correct that line, or"),
         ("a.ply", HEAD.format(41) + "end_header\n" + "\n".join(rows()), "cut short: its last 1 points are missing"),
+        ("a.pts", "\n".join(["30", *rows()[:30], "12", *rows()[30:]]), "cut short: its last 2 points are missing"),
         ("a.ply", HEAD.format(10**12) + "end_header\n" + "\n".join(rows()), "its last 999999999960 points are missing"),
         (
             "a.ply",

@@ -177,11 +177,14 @@ def read_text(path: Path, at_once: int = AT_ONCE) -> Iterator[Columns]:
         StageError: a row is of another length, or the file ends within one.
     """
     layout = text_layout(path)
-    lines, first = islice(_lines(path), layout.above, None), layout.above + 1
+    lines, first, count = islice(_lines(path), layout.above, None), layout.above + 1, 0
     while some := list(islice(lines, at_once)):
         rows = layout.rows(path, some, first, list(layout.columns.values()))
         yield dict(zip(layout.columns, rows.T))
-        first += len(some)
+        first, count = first + len(some), count + len(rows)
+    said = (int(line) for line in _lines(path) if line.strip().isdigit()) if path.suffix.lower() == ".pts" else ()
+    if (missing := sum(said) - count) > 0:
+        raise StageError(f"{path} is cut short: its last {missing} points are missing; copy it again")
 
 
 def _headers(above: list[str], mark: str | None, width: int, unnumbered: int) -> Iterator[list[str]]:
