@@ -125,8 +125,7 @@ def photo_files(folder: Path) -> list[Path]:
         )
     if not photos:
         video = next((file for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)
-        found = f"{len(files)} other files were found"
-        found = f"as an object, give the video itself: {video}" if video else found
+        found = f"as an object, give the video itself: {video}" if video else f"{len(files)} other files were found"
         raise StageError(f"the photo folder {folder} holds no photos; put JPEG, PNG, TIFF or BMP files there ({found})")
     beside = {folder / name for name in beside_photos(folder)}
     return sorted({*photos} - beside, key=lambda file: file.relative_to(folder).as_posix())
