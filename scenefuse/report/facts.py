@@ -269,10 +269,13 @@ def diagnose(item: ObjectSummary) -> list[str]:
         return otherwise if found is None else found
 
     lost = set(known("sparse.not_registered", []))
-    groups = [sorted(lost & set(model["photos"])) for model in known("sparse.models_left_out", [])]
-    if groups := [group for group in groups if group]:
-        lost -= {name for group in groups for name in group}
-        say("apart", [named(group) for group in groups], "; ")
+    groups = list[str]()
+    for model in known("sparse.models_left_out", []):
+        if group := sorted(lost & set(model["photos"])):
+            lost -= set(group)
+            groups.append(named(group))
+    if groups:
+        say("apart", groups, "; ")
     if lost:
         say("lost", sorted(lost))
     if doubtful := known("sparse.doubtful_photos", {}):

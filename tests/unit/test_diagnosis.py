@@ -46,7 +46,7 @@ def test_nothing_is_said_where_all_is_well_or_nothing_has_run():
         (
             {
                 "sparse__not_registered": ["u.jpg", "v.jpg", "w.jpg"],
-                "sparse__models_left_out": [{"photos": ["v.jpg", "w.jpg"]}, {"photos": ["u.jpg"]}],
+                "sparse__models_left_out": [{"photos": ["v.jpg", "w.jpg"]}, {"photos": ["u.jpg", "w.jpg"]}],
             },
             ["not linked to the rest (2): v.jpg, w.jpg; u.jpg; photograph"],
         ),
