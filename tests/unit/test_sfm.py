@@ -603,9 +603,10 @@ def test_photos_are_mapped_again_with_the_lens_that_was_found_where_some_with_ma
     small_capture(tmp_path, weak, missing)
     if weak is not None:
         with pycolmap.Database.open(tmp_path / "database.db") as database:
+            # With wrong matches in all pairs COLMAP tries for 20 s.
             for other in range(1, weak):
                 geometry = database.read_two_view_geometry(other, weak)
-                wrong = np.array(geometry.inlier_matches)
+                wrong = np.array(geometry.inlier_matches)[: 20 * (other >= weak - 2)]
                 wrong[:, 1] = np.roll(wrong[:, 1], 1)
                 geometry.inlier_matches = wrong
                 database.update_two_view_geometry(other, weak, geometry)
