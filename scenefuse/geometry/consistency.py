@@ -108,7 +108,8 @@ def compare(
     compared = others(view, frame_from_cam)
     counts, total = np.zeros((3, len(points)), np.int32), points.astype(np.float64)
     known = np.zeros((0, 0, 0), np.float32) if covered is None else covered
-    cameras = intrinsics.astype(np.float64), frame_from_cam.astype(np.float64)
+    # The kernel is compiled again for each layout of arrays.
+    cameras = intrinsics.astype(np.float64), frame_from_cam.astype(np.float64, order="C")
     _compare(points.astype(np.float64), compared, depths, masks, known, *cameras, tolerance, counts, total)
     agree, through, off_mask = counts
     return DepthAgreement(agree, through, off_mask, total / (agree + 1)[:, None], len(compared))
@@ -215,7 +216,7 @@ def vote(
     depth = own.view.pixels
     agree, through = np.zeros(depth.shape, np.uint16), np.zeros(depth.shape, np.uint16)
     total = np.concatenate([depth[..., None], own.normals, own.colors], axis=2, dtype=np.float32)
-    limit = max_depth_error, max_reprojection_px, math.cos(math.radians(max_normal_error_deg))
+    limit = max_depth_error, float(max_reprojection_px), math.cos(math.radians(max_normal_error_deg))
     for other in others:
         between = _between(own.view, other.view), _between(other.view, own.view)
         _count(

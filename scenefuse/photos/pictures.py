@@ -129,7 +129,8 @@ def _read_map(path: Path, channels: int) -> NDArray[np.float32]:
         raise StageError(f"{path} does not exist; {_made_again(path)}") from None
     except (OSError, ValueError) as error:
         raise StageError(f"{path} is cut short or damaged ({error}); {_made_again(path)}") from None
-    return np.ascontiguousarray(np.moveaxis(pixels, 0, 2), dtype=np.float32)
+    # A copy, which can be written to: kernels are compiled once more for arrays that cannot.
+    return np.array(np.moveaxis(pixels, 0, 2), np.float32, order="C")
 
 
 def _made_again(path: Path) -> str:

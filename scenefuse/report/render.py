@@ -168,7 +168,7 @@ def render(
     # Discs of more than a sixth of the image are points next to the lens: they would only hide the rest.
     radius_px = np.clip(radius * scale, 0.75, min(fine.width_px, fine.height_px) / 6.0).astype(np.float32)
     shown = depth > near
-    picture, surface, size = _splat(
+    picture, total, surface, size = _splat(
         pixels[shown].astype(np.float32),
         depth[shown].astype(np.float32),
         slopes[shown],
@@ -178,6 +178,7 @@ def render(
         fine.width_px,
         fine.height_px,
     )
+    picture /= np.maximum(total, np.float32(1e-30))[..., None]
     covered = np.isfinite(surface)
     if eye_dome > 0 and covered.any():
         low, high = np.percentile(surface[covered], [2, 98])
@@ -222,7 +223,7 @@ def _slopes(cloud: Cloud, camera: Camera, pixels: Array) -> NDArray[np.float32]:
 
 @njit(cache=True, nogil=True)
 def _splat(pixels, depth, slopes, radius_px, radius, rgb, width, height):  # type: ignore[no-untyped-def]
-    """Colours (H, W, 3), nearest depths (H, W; inf where empty) and radii of the nearest discs (H, W), all float32."""
+    """Sums of weighted colours (H, W, 3) and weights, nearest depths (inf: empty) and radii of the nearest discs."""
     surface = np.full((height, width), np.inf, dtype=np.float32)
     size = np.zeros((height, width), dtype=np.float32)
     picture = np.zeros((height, width, 3), dtype=np.float32)
@@ -245,8 +246,9 @@ def _splat(pixels, depth, slopes, radius_px, radius, rgb, width, height):  # typ
                     if blending and depth[i] + radius[i] * np.float32(t / r - 1.5) <= surface[v, u]:
                         w = np.float32(1.02 - q) ** BLENDING_POWER
                         total[v, u] += w
-                        picture[v, u] += w * rgb[i]
-    return picture / np.maximum(total, np.float32(1e-30))[..., None], surface, size
+                        for k in range(3):
+                            picture[v, u, k] += w * rgb[i, k]
+    return picture, total, surface, size
 
 
 @njit(cache=True, nogil=True)
