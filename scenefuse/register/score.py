@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, sampled
+from scenefuse.cloud.clouds import Cloud, sampled, within
 from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import Array, Sim3, apart
 from scenefuse.geometry.depth_test import FreeSpace
@@ -200,11 +200,10 @@ def registration_metrics(
         diagonal: of the full variant's crop.
         unit: of the scene's lengths.
     """
-    moved = scene_from_object.apply(obj.points)
-    ahead, partner = cKDTree(scene.points).query(moved, workers=threads())
-    back = cKDTree(moved).query(scene.points, workers=threads())[0]
-    inlier = ahead <= tau
-    source, target = float(inlier.mean()), float((back <= tau).mean())
+    moved, reach = scene_from_object.apply(obj.points), np.nextafter(tau, np.inf)
+    ahead, partner = cKDTree(scene.points).query(moved, distance_upper_bound=reach, workers=threads())
+    inlier = np.isfinite(ahead)
+    source, target = float(inlier.mean()), float(within(scene.points, moved, tau).mean())
     rmse = float(np.sqrt((ahead[inlier] ** 2).mean())) if inlier.any() else None
     normals_object, normals_scene = (normals_at(points, points) for points in (moved, scene.points))
     facing = np.abs((normals_object[inlier] * normals_scene[partner[inlier]]).sum(1))
