@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud
-from scenefuse.core.stage import threads
+from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import MARGIN
 from scenefuse.fuse.write import GAINS
@@ -179,18 +179,28 @@ def _unfolded(points: Array, faces: Rows, side: int) -> Array:
     faces = faces.copy()
     faces[loose] = np.arange(len(points), len(corners)).reshape(-1, 3)
     mesh = o3d.t.geometry.TriangleMesh(tensor(corners.astype(np.float32)), tensor(faces))
-    mesh.compute_uvatlas(size=side, parallel_partitions=PARTS, nthreads=threads())
+    try:
+        mesh.compute_uvatlas(size=side, parallel_partitions=PARTS, nthreads=threads())
+    except RuntimeError as error:
+        raise StageError(f"UVAtlas cannot unfold the surface ({str(error).rsplit(':', 1)[-1].strip()})") from None
     uv = mesh.triangle.texture_uvs.numpy().astype(np.float64)
     return np.stack([uv[..., 0], 1 - uv[..., 1]], axis=-1)
 
 
 def _beyond_manifold(faces: Rows) -> NDArray[np.bool_]:
-    """(F,) faces with an edge in the direction in which another has it already; UVAtlas takes a manifold only."""
+    """(F,) faces with an edge in the direction in which another has it already, or with two edges of another: UVAtlas
+    takes a manifold only, in which neighbours share one edge."""
     edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
     first = np.unique(edges, axis=0, return_index=True)[1]
     again = np.ones(len(edges), dtype=bool)
     again[first] = False
-    return np.asarray(again.reshape(-1, 3).any(1))
+    loose: NDArray[np.bool_] = np.asarray(again.reshape(-1, 3).any(1))
+    edge = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)[1].ravel()
+    order = np.argsort(edge, kind="stable")
+    same = np.flatnonzero(np.diff(edge[order]) == 0)
+    pairs, count = np.unique(np.stack([order[same], order[same + 1]], axis=1) // 3, axis=0, return_counts=True)
+    loose[pairs[count > 1, 1]] = True
+    return loose
 
 
 def best_worth(worth: Array) -> Array:
