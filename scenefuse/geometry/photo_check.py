@@ -96,16 +96,22 @@ def unpacked(photos: Photos) -> list[View]:
 
 def read_photos(workspace: Workspace, points: Array) -> Photos:
     """The photos of a workspace that have points (N, 3; its frame) in their picture, packed for the kernel."""
+    rows = showing(workspace.views, points, MAX_PHOTOS)
+    return pack([workspace.gray(workspace.views[k]) for k in rows])
+
+
+def showing(views: list[View], points: Array, most: int) -> NDArray[np.int64]:
+    """Rows of views that have points (N, 3) in their picture; of more than `most` those that cover them best."""
     sample = points[:: max(1, len(points) // 2000)]
-    shown = np.zeros((len(workspace.views), len(sample)), dtype=bool)
-    for row, view in zip(shown, workspace.views):
+    shown = np.zeros((len(views), len(sample)), dtype=bool)
+    for row, view in zip(shown, views):
         row[view.visible(sample)[0]] = True
     rows = np.flatnonzero(shown.any(1))
-    if len(rows) > MAX_PHOTOS:
-        print(f"{MAX_PHOTOS} of the {len(rows)} photos that show the object are compared", flush=True)
-        centres = np.array([workspace.views[k].centre for k in rows])
-        rows = rows[covering(shown[rows], centres, sample, MAX_PHOTOS)]
-    return pack([workspace.gray(workspace.views[k]) for k in rows])
+    if len(rows) > most:
+        print(f"{most} of the {len(rows)} photos that show the object are compared", flush=True)
+        centres = np.array([views[k].centre for k in rows])
+        rows = rows[covering(shown[rows], centres, sample, most)]
+    return rows
 
 
 def covering(shown: NDArray[np.bool_], centres: Array, points: Array, count: int) -> NDArray[np.int64]:

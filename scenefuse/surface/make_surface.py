@@ -13,7 +13,7 @@ from scenefuse.cloud.readers.ply import FIELD, in_file
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Sim3
-from scenefuse.geometry.photo_check import MAX_PHOTOS, covering, moved_view
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MAX_PHOTOS, moved_view, read_photos, showing
 from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.workspace import View, Workspace, read_views
 from scenefuse.surface.gltf import metres_per_unit, place_of_scene, write_glb
@@ -51,7 +51,7 @@ def make_surface(*, inputs: SurfaceInputs, surface: Path, glb: Path, report: Pat
     use_threads(threads())
     views = placed_views(inputs)
     try:
-        found, reason = make_mesh(read_cloud(inputs.fused), [view for _, view in views]), ""
+        found, reason = mesh_of(inputs, views), ""
     except StageError as error:
         print(f"no surface: {error}", flush=True)
         found, reason = _nothing(), str(error)
@@ -77,19 +77,13 @@ def paint(surface: Surface, views: list[tuple[Path, View]]) -> tuple[Textured | 
         surface: in the scene's frame.
         views: cameras there, each with its workspace.
     """
-    sample = surface.vertices.points[:: max(1, len(surface.vertices) // 2000)]
-    shown = np.zeros((len(views), len(sample)), dtype=bool)
-    for row, (_, view) in zip(shown, views):
-        row[view.visible(sample)[0]] = True
-    rows = np.flatnonzero(shown.any(1))
-    if not len(rows):
+    chosen = [views[k] for k in showing([view for _, view in views], surface.vertices.points, 2 * MAX_PHOTOS)]
+    if not chosen:
         return None, "the colours of the points: no photo shows the surface"
-    centres = np.array([views[k][1].centre for k in rows])
-    chosen = [views[k] for k in rows[covering(shown[rows], centres, sample, 2 * MAX_PHOTOS)]]
 
     def read(number: int) -> NDArray[np.uint8]:
         folder, view = chosen[number]
-        return np.asarray(Workspace(folder, [], sample, [], []).rgb(view).pixels)
+        return np.asarray(Workspace(folder, [], view.centre[None], [], []).rgb(view).pixels)
 
     try:
         painted = textured(surface, [view for _, view in chosen], read)
@@ -112,13 +106,22 @@ def placed_views(inputs: SurfaceInputs) -> list[tuple[Path, View]]:
     return found
 
 
+def mesh_of(inputs: SurfaceInputs, views: list[tuple[Path, View]]) -> Surface:
+    """The surface of the completed cloud, by the photos of both sides; errors as of `make_mesh`."""
+    cloud, cameras = read_cloud(inputs.fused), [view for _, view in views]
+    for folder in dict.fromkeys(folder for folder, _ in views):
+        own = Workspace(folder, [view for of, view in views if of == folder], cloud.points, [], [])
+        photos = read_photos(own, cloud.points)
+        if len(photos.views) >= CONFIRMING_PHOTOS:
+            # The object's, which come first, show it best.
+            return make_mesh(cloud, cameras, photos)
+    return make_mesh(cloud, cameras)
+
+
 def _nothing() -> Surface:
     """A surface without faces."""
-    fields: dict[str, NDArray[Any]] = {
-        "evidence": np.zeros(0, np.uint8),
-        "deviation": np.zeros(0, np.float32),
-        "class": np.zeros(0, np.uint8),
-    }
+    kinds = {"evidence": np.uint8, "deviation": np.float32, "class": np.uint8}
+    fields: dict[str, NDArray[Any]] = {name: np.zeros(0, kind) for name, kind in kinds.items()}
     vertices = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), None, fields)
     return Surface(vertices, np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), 0.0)
 

@@ -1,7 +1,8 @@
 """The surface of a completed cloud, each face classed by what photos know of the place (method F7).
 
-Screened Poisson (Kazhdan, Hoppe 2013) gives a closed candidate. What lies beside points stays; of the rest, narrow gaps
-are bridged where their rim is measured and no photo sees through them, and all else stays open.
+Screened Poisson (Kazhdan, Hoppe 2013) gives a closed candidate. What lies beside points stays, and what photos confirm
+as they do points; of the rest, narrow gaps are bridged where their rim is measured and no photo sees through them, and
+all else stays open.
 """
 
 from dataclasses import dataclass, replace
@@ -13,12 +14,13 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample, within
+from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, within
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import MARGIN, MIN_AGREEING, SAME_PLACE_SPACINGS
-from scenefuse.fuse.measure import NEIGHBOURS, SUPPORT, Evidence, with_normals
+from scenefuse.fuse.measure import NEIGHBOURS, SUPPORT, Evidence, measure, with_evidence, with_normals
 from scenefuse.geometry.depth_test import MIN_COSINE
+from scenefuse.geometry.photo_check import Photos
 from scenefuse.photos.workspace import View
 
 Rows = NDArray[np.int64]
@@ -66,7 +68,8 @@ class Surface:
 
     def areas(self) -> Array:
         """(F,) of the faces."""
-        return _areas(self.vertices.points, self.faces)
+        a, b, c = (self.vertices.points[self.faces[:, k]] for k in range(3))
+        return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
     def part(self, chosen: Mask) -> "Surface":
         """Only the chosen faces (F,) and their vertices."""
@@ -76,12 +79,13 @@ class Surface:
         )
 
 
-def make_mesh(cloud: Cloud, views: list[View]) -> Surface:
+def make_mesh(cloud: Cloud, views: list[View], photos: Photos | None = None) -> Surface:
     """The surface of a completed cloud.
 
     Args:
         cloud: of an object and its surroundings; the field `evidence` says which points photos confirm.
         views: the photos of both sides in its frame; without any, nothing shows that a gap is empty space.
+        photos: of the side that shows it best; they confirm faces between points.
 
     Raises:
         StageError: the points lie in a line or in one place, or are too few to have a surface.
@@ -105,11 +109,18 @@ def make_mesh(cloud: Cloud, views: list[View]) -> Surface:
     low, high, beyond = cloud.points.min(0), cloud.points.max(0), MAX_GAP / 2 * cloud.diagonal
     inside = ((middle >= low - beyond) & (middle <= high + beyond)).all(1)
     classes = np.where(near & confirmed[nearest], FaceClass.MEASURED, FaceClass.UNCONFIRMED)
+    if photos is not None:
+        tried = np.flatnonzero(inside & ~near)
+        of_faces = replace(cloud[nearest[tried]], points=middle[tried], normals=normals_of(points[faces[tried]]))
+        matched = measure(of_faces, photos, cloud.diagonal)
+        scene = caster(points, faces[classes == FaceClass.MEASURED])
+        shown = matched.surface & ~_seen_through(points[faces[tried]], scene, views, MARGIN * cloud.diagonal)
+        near[tried[shown]], classes[tried[shown]] = True, FaceClass.MEASURED
+        cloud = concatenate([cloud, with_evidence(matched, Evidence.UNCHECKED)[shown]])
     gaps, is_open = _bridges(points, faces, distance, near, inside, classes, cloud, views)
     classes[gaps] = FaceClass.BRIDGED
-    area = _areas(points, faces)
     kept = near | gaps
-    _, own = tree.query(points, workers=threads())
+    own = cKDTree(cloud.points).query(points, workers=threads())[1]
     vertices = Cloud(points, normals, None if cloud.colors is None else cloud.colors[own])
     fields = cloud.fields
     deviation = fields.get("deviation", np.full(len(cloud), np.nan, np.float32))[own]
@@ -121,7 +132,7 @@ def make_mesh(cloud: Cloud, views: list[View]) -> Surface:
     vertices.fields["deviation"] = np.where(of_vertex == FaceClass.BRIDGED, np.nan, deviation).astype(np.float32)
     vertices.fields["class"] = of_vertex
     whole = Surface(vertices, faces, classes.astype(np.uint8), 0.0, tuple(notes))
-    return replace(whole.part(kept), open_area=float(area[is_open].sum()))
+    return replace(whole.part(kept), open_area=float(whole.areas()[is_open].sum()))
 
 
 def oriented(cloud: Cloud, views: list[View]) -> Cloud:
@@ -250,8 +261,7 @@ def _seen_through(corners: Array, scene, views: list[View], margin: float) -> Ma
     Photos that look along a face are not counted: they may see past it.
     """
     places, count = corners.mean(1), np.zeros(len(corners), np.int64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    normals = normals_of(corners)
     for view in views:
         rows = view.visible(places)[0]
         rays = places[rows] - view.centre
@@ -275,6 +285,7 @@ def _neighbours(faces: Rows) -> tuple[Rows, Mask]:
     return pairs, np.asarray(~shared.reshape(-1, 3).all(1))
 
 
-def _areas(points: Array, faces: Rows) -> Array:
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+def normals_of(corners: Array) -> NDArray[np.float32]:
+    """(F, 3) unit normals of faces (F, 3, 3)."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)).astype(np.float32)

@@ -21,7 +21,7 @@ from scenefuse.geometry.depth_test import MIN_COSINE
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.photos.frames import sharpness
 from scenefuse.photos.workspace import View
-from scenefuse.surface.mesh import FaceClass, Rows, Surface, cast, caster
+from scenefuse.surface.mesh import FaceClass, Rows, Surface, cast, caster, normals_of
 
 # Faces that a textured surface is simplified to: what is finer is in its picture, and to unfold more takes minutes.
 TEXTURED_FACES = 40_000
@@ -128,8 +128,7 @@ def simplified(surface: Surface, faces: int = TEXTURED_FACES) -> Surface:
 def _footprints(surface: Surface, photos: list[View]) -> Array:
     """(V, F) pixels that a unit of a face's area has in each photo that it is in, seen from its front; else 0."""
     corners = surface.vertices.points[surface.faces]
-    middle, normals = corners.mean(1), np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    middle, normals = corners.mean(1), normals_of(corners)
     found = np.zeros((len(photos), len(middle)))
     for row, view in zip(found, photos):
         rows, _, depth = view.visible(middle)

@@ -15,12 +15,14 @@ import rasterio
 import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from support.photographed_plane import photographs
 
 from scenefuse import command_line
 from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3, look_at
 from scenefuse.fuse.measure import Evidence
+from scenefuse.geometry.photo_check import pack
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
 from scenefuse.photos.workspace import View, read_views, write_model
 from scenefuse.report import facts
@@ -158,6 +160,21 @@ def test_a_gap_that_photos_see_through_stays_open():
         middle = surface.vertices.points[surface.faces[surface.classes == FaceClass.BRIDGED]].mean(1)
         bridges.append(int(((np.abs(middle[:, :2]).max(1) < 0.03) & (np.abs(middle[:, 2] - 1) < 0.03)).sum()))
     assert bridges[0] > 5 and bridges[1] == 0
+
+
+def plane(gap: float, step: float = 0.02) -> Cloud:
+    """A square of two, seen from above, with a round gap in its middle."""
+    x, y = (a.ravel() for a in np.meshgrid(*[np.arange(-1, 1, step)] * 2))
+    square = with_evidence(np.column_stack([x, y, 0 * x]), np.tile([0, 0, 1], (len(x), 1)))
+    return with_hole(square, gap, np.zeros(3))
+
+
+@pytest.mark.parametrize(("height", "kind"), [(0.0, FaceClass.MEASURED), (0.3, None)])
+def test_a_wide_gap_is_measured_where_photos_confirm_the_surface_across_it_and_else_stays_open(height, kind):
+    shift = Sim3(1.0, np.eye(3), np.array([0, 0, height]))
+    surface = make_mesh(plane(0.2).transformed(shift), [], pack(photographs(8, 3.0)))
+    inner = surface.classes[away(surface, np.array([0, 0, height])) < 0.15]
+    assert len(inner) == 0 if kind is None else (inner == kind).mean() > 0.95 and len(inner) > 50
 
 
 def test_a_slit_is_bridged_up_to_where_it_widens():
