@@ -110,16 +110,16 @@ def row(results: Path, name: str) -> dict[str, str]:
     return {
         "measure": name,
         "completed cloud, F at 0.25 %; 0.5 %; 1 %": f_scores(scores[0]),
-        "surface, F at 0.25 %; 0.5 %; 1 %": f_scores(scores[1]),
+        "surface, the same": f_scores(scores[1]),
         "area measured; unconfirmed; bridged; open (%)": "; ".join(
             f"{100 * value(report, share):.1f}" for share in ("measured", "unconfirmed", "bridged", "open")
         ),
-        "true surface that a photo shows, within 0.5 %; 1 % of the surface (%)": "; ".join(
+        "seen surface closed to 0.5; 1 (%)": "; ".join(
             f"{100 * scores[1][at]['recall']:.1f}" for at in ("05pct", "1pct")
         ),
-        "bridged area within 1 % of the truth (%)": f"{100 * (error <= 0.01).mean():.1f}",
+        "bridged area within 1 % (%)": f"{100 * (error <= 0.01).mean():.1f}",
         "held-out PSNR in the mask, texture; NeRF (dB)": "; ".join(f"{dB:.1f}" for dB in in_mask),
-        "held-out PSNR on the object, texture; NeRF (dB)": "; ".join(f"{dB:.1f}" for dB in on_object),
+        "the same on the object": "; ".join(f"{dB:.1f}" for dB in on_object),
         "processor time, mesh; texture (s)": f"{mesh_s:.0f}; {texture_s:.0f}",
     }
 
