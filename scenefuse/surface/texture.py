@@ -69,7 +69,7 @@ def textured(surface: Surface, photos: list[View], read: Callable[[int], NDArray
     # Unfolded pieces cover about half of a picture.
     wanted = 2 * small.areas()[painted].sum() * np.median(pixels[pixels > 0])
     side = int(np.clip(np.sqrt(wanted), 64, MAX_SIDE_PX))
-    uv = _unfolded(points, faces, side)
+    uv = unfolded(points, faces, side)
     face, weights, places = _texels(points, faces, uv, side)
     of_face, of_vertex = best_worth(worth[:, painted]), vertex_worth(worth[:, painted], faces, len(points))
     color, weight = np.zeros((len(face), 3)), np.zeros(len(face))
@@ -168,12 +168,12 @@ def _worth(
     return worth, gains
 
 
-def _unfolded(points: Array, faces: Rows, side: int) -> Array:
+def unfolded(points: Array, faces: Rows, side: int) -> Array:
     """(F, 3, 2) places of the faces' corners in a picture of a side, from its upper left, 0..1."""
     import open3d as o3d
 
     tensor = o3d.core.Tensor.from_numpy
-    loose = _beyond_manifold(faces)
+    loose = beyond_manifold(faces)
     corners = np.append(points, points[faces[loose]].reshape(-1, 3), axis=0) - points.mean(0)
     faces = faces.copy()
     faces[loose] = np.arange(len(points), len(corners)).reshape(-1, 3)
@@ -186,7 +186,7 @@ def _unfolded(points: Array, faces: Rows, side: int) -> Array:
     return np.stack([uv[..., 0], 1 - uv[..., 1]], axis=-1)
 
 
-def _beyond_manifold(faces: Rows) -> NDArray[np.bool_]:
+def beyond_manifold(faces: Rows) -> NDArray[np.bool_]:
     """(F,) faces with an edge in the direction in which another has it already, or with two edges of another: UVAtlas
     takes a manifold only, in which neighbours share one edge."""
     edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)

@@ -193,7 +193,7 @@ def test_names_are_made_of_what_files_are_called_and_said(tmp_path, monkeypatch,
         Path("shots", name).parent.mkdir(parents=True, exist_ok=True)
         Path("shots", name).write_bytes(b"photo")
     init(Path("other"), objects=(Path("shots"),))
-    assert "shots: an object, 3 photos, 1 of them in small/\n" in capsys.readouterr().out
+    assert "shots: an object, 3 photos, 1 of them in small/, which is few" in capsys.readouterr().out
     assert "Hauschen_neu\tsite\t" in Path("new/config/objects.tsv").read_text()
 
 

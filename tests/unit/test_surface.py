@@ -34,7 +34,7 @@ from scenefuse.surface.drawings import NOTHING, SIDES, draw, draw_surface, facad
 from scenefuse.surface.gltf import Painted, write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
 from scenefuse.surface.mesh import FaceClass, Surface, make_mesh
-from scenefuse.surface.texture import _beyond_manifold, _unfolded, textured
+from scenefuse.surface.texture import beyond_manifold, textured, unfolded
 
 # Spacing of points on a sphere, and the radius of a gap in it that is narrow beside its diagonal.
 STEP, NARROW = 0.012, 0.032
@@ -543,9 +543,9 @@ def test_a_report_on_paper_of_what_failed_says_so(tmp_path: Path):
 def test_faces_that_share_two_edges_are_unfolded_by_themselves():
     # UVAtlas ends the stage on a face whose back is another one, or that is folded upon its neighbour at a point.
     square, twin, fold = [[0, 1, 2], [1, 3, 2]], [[2, 1, 0]], [[2, 0, 4], [4, 0, 2]]
-    assert not _beyond_manifold(np.array(square)).any()
-    assert _beyond_manifold(np.array(square + twin)).sum() == 1
-    assert _beyond_manifold(np.array(square + fold)).sum() >= 1
+    assert not beyond_manifold(np.array(square)).any()
+    assert beyond_manifold(np.array(square + twin)).sum() == 1
+    assert beyond_manifold(np.array(square + fold)).sum() >= 1
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [-1, 1, 0.0]])
-    uv = _unfolded(points, np.array(square + twin), 64)
+    uv = unfolded(points, np.array(square + twin), 64)
     assert uv.shape == (3, 3, 2) and np.isfinite(uv).all()
