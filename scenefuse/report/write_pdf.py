@@ -107,6 +107,9 @@ class _Page(FPDF):
         width = (self.epw - GAP_MM * (len(shown) - 1)) / len(shown)
         highest = width * max(h / w for w, h in sizes)
         left = self.eph + self.t_margin - self.get_y() - 2 * GAP_MM
+        if left < highest / 4:
+            self.add_page()
+            left = self.eph - 2 * GAP_MM
         width *= min(1.0, left / highest)
         top = self.get_y()
         self.set_font("sans", size=8)

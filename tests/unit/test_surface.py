@@ -540,6 +540,17 @@ def test_a_report_on_paper_of_what_failed_says_so(tmp_path: Path):
     assert "oo little overlap" in pypdfium2.PdfDocument(tmp_path / "r.pdf")[0].get_textpage().get_text_bounded()
 
 
+def test_pictures_below_a_long_text_on_paper_go_on_on_a_new_page(tmp_path: Path):
+    (tmp_path / "shed/figures").mkdir(parents=True)
+    for name in ("before", "after"):
+        Image.new("RGB", (400, 300)).save(tmp_path / f"shed/figures/{name}.png")
+    for words in range(480, 600, 15):
+        (tmp_path / "objects.tsv").write_text(f"object\tstatus\terror\nshed\tfailed\t{'overlap ' * words}\n")
+        write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")
+        images = [one for page in pypdfium2.PdfDocument(tmp_path / "r.pdf") for one in page.get_objects([3])]
+        assert len(images) == 2 and all(top - low > 40 for _, low, _, top in (image.get_bounds() for image in images))
+
+
 def test_faces_that_share_two_edges_are_unfolded_by_themselves():
     # UVAtlas ends the stage on a face whose back is another one, or that is folded upon its neighbour at a point.
     square, twin, fold = [[0, 1, 2], [1, 3, 2]], [[2, 1, 0]], [[2, 0, 4], [4, 0, 2]]
