@@ -1,11 +1,10 @@
-"""The points of a scene that belong to a marked object: a box or hull, without the ground and without loose parts."""
+"""The points of a scene that belong to a marked object: a box, without the ground and without loose parts."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from scenefuse.cloud.clouds import Cloud, parts, spacing, voxels, within
 from scenefuse.core.stage import setting
@@ -43,8 +42,6 @@ class CropSettings:
     this cloud), seen through the alignment from shared features, and only where photos share too few the file in the
     column `fiducials`; or this file in any case. An object without it, and without photos on both sides, is searched in
     the whole scene."""
-    shape: Literal["box", "oriented", "hull"] = setting("box")
-    """The fiducials' box, the same turned about the vertical to their least footprint, or their convex hull."""
     margin: float = setting(0.05, least=0)
     """Widening of the box on every side, as a share of its own extent."""
     remove_ground: bool = setting(True)
@@ -66,9 +63,8 @@ class Crop:
     Attributes:
         keep: (N,) bool over the scene's points, True on the object.
         on_ground: (N,) bool, True for points in it that were removed as ground.
-        shape: box, oriented or hull: what was cut out; None for the whole scene.
-        level_from_scene: (3, 3) rotation that turns the scene's up into z, and the box's sides into x and y.
-        low: (3,) least corner of the box (around the hull) in the level frame.
+        level_from_scene: (3, 3) rotation that turns the scene's up into z.
+        low: (3,) least corner of the box in the level frame.
         high: (3,) greatest corner.
         ground: the fitted ground on which the object stands, or None.
         notes: what was not done and why.
@@ -76,7 +72,6 @@ class Crop:
 
     keep: NDArray[np.bool_]
     on_ground: NDArray[np.bool_]
-    shape: str | None
     level_from_scene: Array
     low: Array
     high: Array
@@ -88,7 +83,7 @@ def whole(scene: Cloud) -> Crop:
     """The whole scene as a crop."""
     everything = np.ones(len(scene), dtype=bool)
     note = "nothing was cut out: the object is looked for in the whole scene, as if that showed little else"
-    return Crop(everything, ~everything, None, np.eye(3), scene.points.min(0), scene.points.max(0), None, [note])
+    return Crop(everything, ~everything, np.eye(3), scene.points.min(0), scene.points.max(0), None, [note])
 
 
 def crop_cloud(
@@ -96,14 +91,12 @@ def crop_cloud(
 ) -> Crop:
     """The points of a scene that belong to the object marked by fiducials (F, 3), without those known to be `other`."""
     level = rotation_between(up, UP)
-    if settings.shape == "oriented" and not settings.minimal:
-        level = least_footprint(fiducials @ level.T) @ level
     points, marks = scene.points @ level.T, fiducials @ level.T
     extent = np.ptp(marks, axis=0)
     if settings.minimal:
         low, high = marks.min(0), marks.max(0)
         inside = ((points >= low) & (points <= high)).all(1)
-        return Crop(inside, np.zeros_like(inside), "box", level, low, high, None, [])
+        return Crop(inside, np.zeros_like(inside), level, low, high, None, [])
     diagonal = float(np.linalg.norm(extent))
     margin = settings.margin * extent + 2 * SCORE_FRACTION * diagonal
     low, high = marks.min(0) - margin, marks.max(0) + margin
@@ -112,13 +105,7 @@ def crop_cloud(
         # Fiducials are clicked where the scene shows the object; what it stands on bounds it below.
         corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
         low[2] = min(low[2], ground.height(corners).min() - GROUND_FRACTION * diagonal)
-    in_box, shape = ((points >= low) & (points <= high)).all(1), settings.shape
-    if shape == "hull":
-        try:
-            in_box[in_box] = in_wide_hull(points[in_box], marks, low[2], margin)
-        except QhullError:
-            shape = "box"
-            notes.append("the fiducials lie in one vertical plane and span no hull: their box was cut out instead")
+    in_box = ((points >= low) & (points <= high)).all(1)
     away = np.zeros(len(points), dtype=bool)
     if ground is not None and in_box.any():
         away = on_ground(points, marks, ground, in_box)
@@ -130,7 +117,7 @@ def crop_cloud(
             notes.append("the ground around the box does not continue into it: nothing was removed as ground")
     keep = in_box & ~away if other is None else in_box & ~away & ~other
     keep, said = _without_loose_parts(points, keep, marks, diagonal)
-    return Crop(keep, away, shape, level, low, high, ground, notes + said)
+    return Crop(keep, away, level, low, high, ground, notes + said)
 
 
 def _without_loose_parts(
@@ -205,7 +192,7 @@ def on_ground(points: Array, marks: Array, ground: Ground, in_box: NDArray[np.bo
         points: (N, 3) the scene's, z up.
         marks: (F, 3) the fiducials.
         ground: of `ground_under`.
-        in_box: (N,) the points in the box or hull, one at least.
+        in_box: (N,) the points in the box, one at least.
     """
     foot, height = _foot(marks)
     diagonal = float(np.linalg.norm(np.ptp(marks, axis=0)))
@@ -245,36 +232,3 @@ def _foot(marks: Array) -> tuple[Array, float]:
     strays = int(STRAY_SHARE * len(marks))
     foot = marks[order[strays]]
     return foot, float(marks[order[-1 - strays], 2] - foot[2])
-
-
-def least_footprint(points: Array) -> Array:
-    """(3, 3) turn about z after which the box of (N, 3) points has the least footprint; at most 45 degrees.
-
-    A rectangle of least area has a side along an edge of the convex hull (Freeman and Shapira 1975). Points along one
-    line are turned along x or y, whichever is nearer.
-    """
-    try:
-        hull = points[ConvexHull(points[:, :2]).vertices, :2]
-    except QhullError:
-        hull = np.linalg.svd(points[:, :2] - points[:, :2].mean(0), full_matrices=False)[2][:1] * [[1.0], [-1.0]]
-    edges = np.roll(hull, -1, axis=0) - hull
-    angles = np.arctan2(edges[:, 1], edges[:, 0])
-    angles = (angles + np.pi / 4) % (np.pi / 2) - np.pi / 4
-    turns = [np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1.0]]) for a in angles]
-    return min(turns, key=lambda turn: float(np.prod(np.ptp(points[:, :2] @ turn[:2, :2].T, axis=0))))
-
-
-def in_wide_hull(points: Array, marks: Array, floor: float, margin: Array) -> NDArray[np.bool_]:
-    """(N,) points in the convex hull of marks (F, 3) and of their copies at the height `floor`, grown on all sides.
-
-    A face is moved outwards by as much of the `margin` (3,) along x, y and z as its normal has.
-
-    Raises:
-        QhullError: the marks lie in one vertical plane.
-    """
-    dropped = np.column_stack([marks[:, :2], np.full(len(marks), floor)])
-    planes = ConvexHull(np.concatenate([marks, dropped])).equations
-    inside = np.ones(len(points), dtype=bool)
-    for plane in planes:
-        inside &= points @ plane[:3] + plane[3] <= np.abs(plane[:3]) @ margin
-    return inside

@@ -289,7 +289,7 @@ def _announce(cut: Crop, source: str) -> None:
         print(note, flush=True)
     if cut.keep.sum() < MIN_POINTS:
         raise StageError(
-            f"only {cut.keep.sum()} scene points are left in the {cut.shape} of {source}, {MIN_POINTS} are"
+            f"only {cut.keep.sum()} scene points are left in the box of {source}, {MIN_POINTS} are"
             " needed: the scene may not show the object, or a fiducial or mask may not lie on it; where the scene's"
             " photos show it small, raise scene.depth_maps.max_image_size_px or set scene.dense_cloud.min_photos to 2"
         )
@@ -310,7 +310,6 @@ def _check_near(names: list[str], points: Array, cloud: Cloud, path: Path) -> No
 def _report(scene_points: int, part: Cloud, cut: Crop, unit: str) -> dict[str, object]:
     """The stage JSON of a crop."""
     return {
-        "shape": quantity(cut.shape, ""),
         "level_from_scene": quantity(cut.level_from_scene, ""),
         "box_low": quantity(cut.low, unit),
         "box_high": quantity(cut.high, unit),
@@ -318,7 +317,6 @@ def _report(scene_points: int, part: Cloud, cut: Crop, unit: str) -> dict[str, o
         "crop_points": quantity(len(part), "1"),
         "diagonal": quantity(part.diagonal, unit),
         "spacing": quantity(spacing(part.points), unit),
-        "ground_removed": quantity(bool(cut.on_ground.any()), ""),
         "ground_points": quantity(int(cut.on_ground.sum()), "1"),
         "notes": quantity(cut.notes, ""),
     }

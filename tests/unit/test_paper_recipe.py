@@ -67,7 +67,7 @@ def test_the_constants_are_the_papers():
     assert preset["scene"]["depth_maps"] | {"max_image_size_px": 2000, "sources": 8} == preset["scene"]["depth_maps"]
     assert preset["object"]["recipe"] == "paper" and preset["object"]["stage1"]["pose_source"] == "chain"
     crop = preset["registration"]["crop"]
-    box = {"mode": "fiducials", "shape": "box", "margin": 0, "remove_ground": False}
+    box = {"mode": "fiducials", "margin": 0, "remove_ground": False}
     assert crop | box == crop and preset["fusion"]["mode"] == "append"
     assert preset["registration"]["variants"] == ["full", "no_scale", "no_crop"]
     assert preset["object"]["masks"]["method"] == "sam2"
