@@ -24,7 +24,6 @@ from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.object_cloud import CloudSettings
-from scenefuse.nerf.train_depth import DepthTrainingSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
 from scenefuse.paper.compare_with_paper import ComparisonSettings
@@ -128,7 +127,7 @@ SECTIONS: dict[str, list[Any]] = {
     "object.sparse": [MappingSettings()],
     "object.undistort": [UndistortSettings(max_size_px=1600)],
     "object.masks": [MaskSettings()],
-    "object.stage1": [PoseSourceSettings(), DepthTrainingSettings()],
+    "object.stage1": [PoseSourceSettings(), MonocularSettings()],
     "object.stage2": [Schedule()],
     "object.stage3": [MonocularSettings(epochs=5)],
     "object.stage4": [Schedule()],

@@ -16,13 +16,12 @@ from torch import Tensor
 from scenefuse.core.checkpoints import key_of
 from scenefuse.core.stage import StageError, atomic_directory, quantity, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
-from scenefuse.nerf.prior_inputs import DepthPhotos, depth_photos
-from scenefuse.nerf.prior_training import Recipe, loss_quantities, optimise, predict, prepare_torch
 from scenefuse.nerf.rendered_maps import DepthPrior, read_stage_maps, write_prior
-from scenefuse.nerf.train_depth import align_maps, depths_at
 from scenefuse.nerf.train_object_nerf import MIN_CONFIDENCE
 from scenefuse.paper import monocular
+from scenefuse.paper.depth_photos import DepthPhotos, align_maps, depth_photos, depths_at
 from scenefuse.paper.monocular import Content, MonocularSettings, Networks, Supervision
+from scenefuse.paper.network_training import Recipe, loss_quantities, optimise, predict, prepare_torch
 from scenefuse.photos.views import Views, load_views
 from scenefuse.photos.workspace import read_workspace, write_model
 from scenefuse.sfm.gravity import estimate_up
@@ -206,7 +205,7 @@ class Stage:
 
     def run(self, networks: Networks, supervision: Supervision, epochs: int, content: Content) -> None:
         """Train, and write depth maps, networks, poses and the report, with `content`."""
-        start, recipe = time.monotonic(), monocular.recipe_of(epochs)
+        start, recipe = time.monotonic(), Recipe(epochs)
         print(f"{len(self.views.names)} frames, {recipe.steps(self.frames)} steps", flush=True)
         key = key_of("paper", recipe, self.seed, self.frames, supervision, networks.state())
         checkpoint = self.checkpoints / key / "state.pt"

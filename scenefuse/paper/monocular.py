@@ -4,7 +4,6 @@ Lengths are in the networks' own unit, about the distance of the camera to the o
 In stage 3 they learn two sets of depth maps, fused by inverse variance where views agree (after AltNeRF; method N12).
 """
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,9 @@ from torch.nn import functional
 from scenefuse.core.checkpoints import State, read_state
 from scenefuse.core.stage import StageError, quantity, setting
 from scenefuse.core.transforms import Array, rotation_angle_deg
-from scenefuse.nerf.monodepth import (
+from scenefuse.nerf.rendered_maps import MAP_AGREEMENT
+from scenefuse.paper.depth_photos import DepthPhotos, residual_at_checks
+from scenefuse.paper.monodepth import (
     DepthNetwork,
     convolutions,
     depth_from_disparity,
@@ -30,10 +31,7 @@ from scenefuse.nerf.monodepth import (
     sample,
     smoothness,
 )
-from scenefuse.nerf.prior_inputs import DepthPhotos
-from scenefuse.nerf.prior_training import Objective, PhotoScale, Recipe, huber, reprojection_error
-from scenefuse.nerf.rendered_maps import MAP_AGREEMENT
-from scenefuse.nerf.train_depth import residual_at_checks
+from scenefuse.paper.network_training import Objective, PhotoScale, Recipe, huber, reprojection_error
 from scenefuse.photos.views import Views
 
 # What the depth network can say: an object that fits into its photos, about 1 away, is neither nearer nor farther.
@@ -150,14 +148,9 @@ class MonocularSettings:
     """How long the networks train, and on what."""
 
     epochs: int = setting(15, least=0)
-    """Epochs of this stage, each over all photos."""
+    """Recipe `paper` only: epochs of this stage, each over all photos."""
     width_px: int = 192
     """Width of the frames, pixels."""
-
-
-def recipe_of(epochs: int) -> Recipe:
-    """The paper's batches and warm-up, which are the shipped ones, and its last batches, which hold the rest."""
-    return Recipe(epochs, even=False)
 
 
 def frames_of(views: Views, device: torch.device) -> DepthPhotos:
@@ -255,8 +248,7 @@ def monocular_losses(networks: Networks, frames: DepthPhotos, supervision: Super
             target, weight = supervision.target[chosen], supervision.weight[chosen]
             given = torch.where(weight > 0, target, depth.detach())
             error, seen = reprojection_error(scale, chosen, sources, given, moves, None)
-            # Nothing says that these networks' depth is nearly right: every error counts in full.
-            off = huber(depth / target.clamp_min(NEAR) - 1.0, math.inf)
+            off = huber(depth / target.clamp_min(NEAR) - 1.0)
             parts["target"] = (off * weight).sum() / weight.sum().clamp_min(1.0)
             parts["pose"] = masked_mean(error, seen)
         return parts

@@ -15,10 +15,10 @@ from torch import Tensor
 from scenefuse.core.stage import quantity, read_json, write_json
 from scenefuse.core.transforms import DEPTH_JUMP
 from scenefuse.nerf.field import Field, FieldSettings, encode
-from scenefuse.nerf.prior_training import LEARNING_RATE, Recipe
 from scenefuse.nerf.rays import DEPTH_DELTA, SOLID_OPACITY, LossWeights, PhotoTensors, dilate
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, prepare_device, train_stage
 from scenefuse.nerf.training import OCCUPANCY_EVERY, Nerf, NerfRecipe, Rendered, Schedule
+from scenefuse.paper.network_training import LEARNING_RATE, Recipe
 from scenefuse.photos.views import load_views
 
 # Batches, warm-up and rate are the depth network's. The paper has neither samples near the prior, nor turned rays, nor

@@ -28,11 +28,11 @@ FEATURES_S, PAIR_S, MAPPING_S = 0.3, 6e-9, 7e-4
 STEREO_S, MAPS_S = 3.5, 1.5
 MAP_READERS = {
     "scene": ("fuse_depth_maps", "estimate_scene_spread"),
-    "object": ("refine_depth", "make_object_cloud", "fuse_object", "find_missing"),
+    "object": ("estimate_depth_prior", "refine_depth", "make_object_cloud", "fuse_object", "find_missing"),
 }
 MASK_S = {"sam2": 13.0, "grabcut": 0.9}
-# A photo in an epoch of the depth network; a ray.
-DEPTH_NETWORK_S, RAY_S = 0.13, 5.5e-5
+# A ray of a NeRF.
+RAY_S = 5.5e-5
 # The clock's time, over processor seconds shared by all cores: jobs that wait for each other leave some idle.
 IDLE_FACTOR = 1.15
 # A forecast is right within this factor: what is short by more cannot do.
@@ -133,7 +133,6 @@ def job_seconds(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) 
         rays = own["nerf"]["rays_per_epoch"]
         work = {
             "make_masks": MASK_S["grabcut" if own["masks"]["method"] == "grabcut" else "sam2"] * photos.count,
-            "train_depth": DEPTH_NETWORK_S * own["stage1"]["epochs"] * photos.count,
             "train_object_nerf": RAY_S * own["stage2"]["epochs"] * rays,
             "retrain_object_nerf": RAY_S * own["stage4"]["epochs"] * rays,
         }

@@ -1,4 +1,4 @@
-"""Refine one object's depth networks with the depth its NeRF renders (stage 3)."""
+"""Correct the depth that one object's NeRF renders by the photos (stage 3)."""
 
 from scenefuse.core.stage import run
 from scenefuse.nerf.rendered_maps import refine_depth

@@ -35,7 +35,7 @@ STAGES = {
     "undistortion": ("undistort_object_photos-shed0", "sfm/undistort_photos.py", "sparse/cameras.bin"),
     "stereo": ("estimate_depth_maps-yard-0", "mvs/estimate_depth_maps.py", "undistorted/sparse/points3D.bin"),
     "masks": ("make_masks-shed0", "masks/make_masks.py", "undistorted.json"),
-    "stage-1": ("train_depth-shed0", "nerf/train_depth.py", "undistorted/sparse/images.bin"),
+    "stage-1": ("estimate_depth_prior-shed0", "nerf/estimate_depth_prior.py", "undistorted/sparse/images.bin"),
     "stage-2": ("train_object_nerf-shed0", "nerf/train_object_nerf.py", "stage1/depth_maps/*"),
     "stage-3": ("refine_depth-shed0", "nerf/refine_depth.py", "stage2/depth_maps/*"),
     "stage-4": ("retrain_object_nerf-shed0", "nerf/train_object_nerf.py", "stage3/depth_maps/*"),

@@ -22,19 +22,18 @@ from demo.capture import OrbitSettings, render_object
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import quantity, run, write_json
 from scenefuse.metrics.truth import Cameras, read_cameras, read_mesh, sample_surface, visible
+from scenefuse.nerf.depth_prior import estimate_depth_prior
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.rendered_maps import refine_depth
-from scenefuse.nerf.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 
 # A quarter of stage 1's pixels: what counts is how the cost grows with the photos.
 SMALL_PX = 72
 # Functions of a stage whose share is listed by itself: module, function -> part.
 PARTS = {
-    ("scenefuse.nerf.train_depth", "load_views"): "loading",
-    ("scenefuse.nerf.train_depth", "network_inputs"): "stereo",
-    ("scenefuse.nerf.train_depth", "train_network"): "training",
-    ("scenefuse.nerf.train_depth", "confirm"): "refinement",
+    ("scenefuse.nerf.depth_prior", "load_views"): "loading",
+    ("scenefuse.nerf.depth_prior", "first_depth"): "stereo",
+    ("scenefuse.nerf.depth_prior", "confirm"): "refinement",
     ("scenefuse.nerf.rendered_maps", "load_views"): "loading",
     ("scenefuse.nerf.rendered_maps", "confirm"): "refinement",
     ("scenefuse.nerf.train_object_nerf", "load_views"): "loading",
@@ -107,11 +106,9 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
 
     start, began = time.monotonic(), os.times()
     if part == "stage1":
-        train_depth(
-            workspace=undistorted, masks=masks, **common, stage=folder / part,
-            report=folder / "stage1.json",
-            settings=replace(build(DepthTrainingSettings, own["stage1"]), crop_px=SMALL_PX),
-            width_px=own["nerf"]["width_px"],
+        estimate_depth_prior(
+            workspace=undistorted, masks=masks, stage=folder / part, report=folder / "stage1.json",
+            width_px=own["nerf"]["width_px"], hold_out_every=own["hold_out_every"], crop_px=SMALL_PX,
         )  # fmt: skip
     elif part == "stage2":
         nerf(2, 1, None)

@@ -31,10 +31,10 @@ from scenefuse.core.stage import StageError, run
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.nerf.field import FieldSettings, encode, hash_grid
-from scenefuse.nerf.prior_training import Recipe, optimise, predict
 from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.render import UNIFORM_SHARE, march, no_prior, render_view
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, keep_memory, new_nerf, train
+from scenefuse.paper.network_training import Recipe, optimise, predict
 
 HAVE_GPU = torch.cuda.is_available()
 GPU: Literal["cpu", "cuda"] = "cuda" if HAVE_GPU else "cpu"
@@ -346,8 +346,8 @@ def sam2() -> Row:
 def whole_object(folder: Path) -> Row:
     """The four stages of a finished object again, on the GPU: held-out PSNR beside the CPU's."""
     from scenefuse.core.stage import read_json, value
+    from scenefuse.nerf.depth_prior import estimate_depth_prior
     from scenefuse.nerf.rendered_maps import refine_depth
-    from scenefuse.nerf.train_depth import DepthTrainingSettings, train_depth
     from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 
     settings = read_settings(ROOT / "config/demo.yaml")["object"]
@@ -369,14 +369,13 @@ def whole_object(folder: Path) -> Row:
             )
 
         steps: dict[int, Callable[[], None]] = {
-            1: lambda: train_depth(
-                **photos,
-                **places[1],
-                checkpoints=out / "checkpoints",
-                settings=build(DepthTrainingSettings, settings["stage1"]),
+            1: lambda: estimate_depth_prior(
+                workspace=photos["workspace"],
+                masks=photos["masks"],
+                stage=places[1]["stage"],
+                report=places[1]["report"],
                 width_px=width,
                 hold_out_every=held,
-                seed=0,
             ),
             2: lambda: nerf(2, None),
             3: lambda: refine_depth(

@@ -38,7 +38,7 @@ FUSION: dict[str, dict[str, Any] | None] = {
     "two photos": STRICT | {"min_photos": 2},
     "object": None,
 }
-STAGES = ("train_depth", "train_object_nerf", "refine_depth", "retrain_object_nerf", "make_object_cloud")
+STAGES = ("estimate_depth_prior", "train_object_nerf", "refine_depth", "retrain_object_nerf", "make_object_cloud")
 
 
 def mask_depths(depth: Path, views: Views) -> None:

@@ -25,16 +25,15 @@ from demo.world import World, build_world, openness
 from scenefuse.core.stage import run, threads, value
 from scenefuse.core.transforms import Array, fit_sim3, look_at
 from scenefuse.metrics.truth import Cameras, pinhole
-from scenefuse.nerf.prior_training import optimise, predict, prepare_torch
 from scenefuse.paper.estimate_as_paper import chained, trajectory_error
 from scenefuse.paper.monocular import (
     frames_of,
     monocular_losses,
     new_monocular_networks,
     pose_quantities,
-    recipe_of,
     supervision_of,
 )
+from scenefuse.paper.network_training import Recipe, optimise, predict, prepare_torch
 from scenefuse.photos.views import Views
 
 # As the demo's photos, at the width of the paper's stage 1.
@@ -95,7 +94,7 @@ def learned(views: Views, true: Array, diagonal: float, epochs: int, seed: int) 
     start = time.monotonic()
     device = prepare_torch(seed)
     frames, networks = frames_of(views, device), new_monocular_networks(device)
-    supervision, recipe = supervision_of(frames), recipe_of(epochs)
+    supervision, recipe = supervision_of(frames), Recipe(epochs)
     objective = monocular_losses(networks, frames, supervision, recipe)
     with tempfile.TemporaryDirectory() as folder:
         optimise(networks.parts(), frames, objective, recipe, Path(folder) / "state.pt", seed)

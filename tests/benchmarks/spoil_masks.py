@@ -2,8 +2,9 @@
 
 cp -a results spoilt/results and work in spoilt/, a copy of the project. Then
 PYTHONPATH=. python tests/benchmarks/spoil_masks.py --masks results/objects/house/masks
-snakemake --configfile config/demo.yaml --cores 2 --rerun-triggers mtime -R train_depth --allowed-rules train_depth \\
-    train_object_nerf refine_depth retrain_object_nerf make_object_cloud -- results/objects/house/object.ply
+snakemake --configfile config/demo.yaml --cores 2 --rerun-triggers mtime -R estimate_depth_prior --allowed-rules \\
+    estimate_depth_prior train_object_nerf refine_depth retrain_object_nerf make_object_cloud -- \\
+    results/objects/house/object.ply
 and give that cloud to completed_scene.py: --objects house --object spoilt/results/objects/house/object.ply
 """
 

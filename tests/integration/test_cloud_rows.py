@@ -136,7 +136,7 @@ def test_a_crs_that_is_none_stops_before_anything_runs(project, tmp_path, snakem
 
 SFM = {"map_scene_photos", "map_object_photos", "undistort_scene_photos", "undistort_object_photos", "align_models"}
 STEREO = {"estimate_depth_maps", "fuse_depth_maps"}
-TRAINING = {"train_depth", "train_object_nerf", "refine_depth", "retrain_object_nerf", "make_object_cloud"}
+TRAINING = {"estimate_depth_prior", "train_object_nerf", "refine_depth", "retrain_object_nerf", "make_object_cloud"}
 POSED = "\tphotos\tcameras\tcloud"
 
 

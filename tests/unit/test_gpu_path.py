@@ -13,11 +13,11 @@ from support.textured_plane import plane_views
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.nerf import field
 from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.prior_training import Recipe, optimise, predict
 from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.render import render_view
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
 from scenefuse.paper.monocular import frames_of, monocular_losses, new_monocular_networks, supervision_of
+from scenefuse.paper.network_training import Recipe, optimise, predict
 from scenefuse.paper.train_nerf_as_paper import NERF, OrderAndEdges
 
 

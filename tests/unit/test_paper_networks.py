@@ -8,7 +8,7 @@ import torch
 from support.textured_plane import plane_views
 
 from scenefuse.core.stage import StageError, value
-from scenefuse.nerf.prior_inputs import depth_photos
+from scenefuse.paper.depth_photos import depth_photos
 from scenefuse.paper.monocular import (
     PoseNetwork,
     fuse_by_inverse_variance,

@@ -14,12 +14,11 @@ from support.textured_plane import plane_views
 from scenefuse.core.settings import ROOT, read_settings
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Sim3, rotation_between
-from scenefuse.nerf import prior_training as training
 from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.prior_training import Recipe, optimise, predict
 from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import NerfRecipe, Schedule
+from scenefuse.paper import network_training as training
 from scenefuse.paper import train_nerf_as_paper as nerf_stage
 from scenefuse.paper.estimate_as_paper import (
     EarlierStages,
@@ -39,10 +38,10 @@ from scenefuse.paper.monocular import (
     monocular_losses,
     neighbours,
     new_monocular_networks,
-    recipe_of,
     small_photos,
     supervision_of,
 )
+from scenefuse.paper.network_training import Recipe, optimise, predict
 from scenefuse.paper.train_nerf_as_paper import RANK_WEIGHT, as_paper, train_nerf_as_paper
 from scenefuse.photos.workspace import View, read_workspace
 from scenefuse.sfm import colmap, matches
@@ -52,10 +51,10 @@ CPU = torch.device("cpu")
 
 
 def test_the_constants_are_the_papers():
-    nerf, depth = nerf_stage.NERF, recipe_of(15)
+    nerf, depth = nerf_stage.NERF, Recipe(15)
     assert (nerf.learning_rate, nerf.grid_learning_rate, training.LEARNING_RATE) == (1e-3, 1e-3, 1e-3)
     assert (nerf.warmup_epochs, depth.warmup_epochs) == (2, 2)
-    assert (nerf.images_per_batch, depth.batch_photos, depth.even) == (24, 24, False)
+    assert (nerf.images_per_batch, depth.batch_photos) == (24, 24)
     assert FieldSettings(levels=16, log2_table=19, finest=2048, width=64) == nerf_stage.FIELD
     assert nerf == NerfRecipe(
         images_per_batch=24, rays_per_image=170, warmup_epochs=2, learning_rate=1e-3, grid_learning_rate=1e-3,
@@ -100,7 +99,7 @@ def test_a_batch_holds_24_frames_and_the_last_one_the_rest(tmp_path):
         return {"photometric": nothing, "smoothness": nothing}
 
     networks = new_monocular_networks(CPU)
-    optimise(networks.parts(), frames, losses, recipe_of(2), tmp_path / "state.pt", 0)
+    optimise(networks.parts(), frames, losses, Recipe(2), tmp_path / "state.pt", 0)
     assert sizes == [24, 24, 11] * 2  # of 60, one is held out
 
 

@@ -317,7 +317,7 @@ def test_the_last_error_is_that_of_the_named_object(tmp_path):
 
 def test_a_killed_job_is_named_with_its_log(results):
     """Its log ends without an error; the jobs before it have finished: their benchmarks are newer than their logs."""
-    for rule in ("make_masks", "train_depth"):
+    for rule in ("make_masks", "estimate_depth_prior"):
         (results / f"logs/{rule}").mkdir()
         (results / f"logs/{rule}/barn.log").write_text("epoch 3 of 20\n")
     (results / "benchmarks/make_masks").mkdir()
@@ -325,7 +325,7 @@ def test_a_killed_job_is_named_with_its_log(results):
     summary = summarise(results, ["barn"])
     text = " ".join((summary / "details.txt").read_text().split())
     assert "object barn: failed" in text and "Not run yet" not in text
-    assert "and run again to go on [train_depth/barn.log]" in text
+    assert "and run again to go on [estimate_depth_prior/barn.log]" in text
     assert read(summary, "registration").set_index(["object", "variant"]).loc[("barn", "full"), "status"] == "failed"
 
 
@@ -342,13 +342,13 @@ def test_a_job_without_an_error_was_killed_or_refused_or_ran_elsewhere(tmp_path)
 
 
 def test_a_job_that_failed_in_this_run_is_the_cause_whatever_earlier_runs_left(tmp_path):
-    logs = [tmp_path / rule / "house.log" for rule in ("fuse_object", "train_depth")]
+    logs = [tmp_path / rule / "house.log" for rule in ("fuse_object", "estimate_depth_prior")]
     for log, text in zip(logs, ("error: of before", "Traceback\nMemoryError: Unable to allocate 2 GiB\n")):
         log.parent.mkdir()
         log.write_text(text)
     why = why_unfinished(JobRecords(tmp_path, tmp_path / "none", (logs[1],)), "house")
     assert why.startswith("the memory, or a limit on it") and why.endswith(
-        "(MemoryError: Unable to allocate 2 GiB) [train_depth/house.log]"
+        "(MemoryError: Unable to allocate 2 GiB) [estimate_depth_prior/house.log]"
     )
     assert why_unfinished(JobRecords(tmp_path, tmp_path / "none", (logs[1],)), "barn") == ""
 

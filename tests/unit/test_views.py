@@ -8,7 +8,7 @@ import pytest
 from scenefuse.core.stage import StageError
 from scenefuse.geometry.visual_hull import Outline, count_silhouettes
 from scenefuse.mvs.sparse_depths import select_views
-from scenefuse.nerf.prior_inputs import crop_to_object
+from scenefuse.nerf.depth_prior import crop_to_object
 from scenefuse.photos.views import load_views, scales
 from scenefuse.photos.workspace import View, read_workspace
 

@@ -1,6 +1,6 @@
-# Depth of an object: a network in stage 1, what the NeRF renders in stage 3, both corrected by the photos.
+# Depth of an object: by stereo and from SfM points in stage 1, what the NeRF renders in stage 3, both corrected by the photos.
 #
-# INPUTS    results/objects/{object}/undistorted/, masks/, stage2/; config: object.stage1, object.nerf.width_px
+# INPUTS    results/objects/{object}/undistorted/, masks/, stage2/; config: object.nerf.width_px
 # OUTPUTS   results/objects/{object}/stage1/, stage1.json, stage3/, stage3.json
 
 
@@ -13,8 +13,8 @@ POSED = (
 )
 
 
-rule train_depth:
-    """Self-supervised depth network, its depth corrected by the photos (paper 3.2 and 4.2.2, stage 1)."""
+rule estimate_depth_prior:
+    """Depth by stereo and from SfM points, corrected by the photos (stage 1; paper 3.2 and 4.2.2 in recipe paper)."""
     input:
         workspace=POSED,
         workspace_json=f"{POSED}.json",
@@ -24,29 +24,25 @@ rule train_depth:
         stage=maps("results/objects/{object}/stage1"),
         report="results/objects/{object}/stage1.json",
     log:
-        "results/logs/train_depth/{object}.log",
+        "results/logs/estimate_depth_prior/{object}.log",
     benchmark:
-        "results/benchmarks/train_depth/{object}.tsv"
+        "results/benchmarks/estimate_depth_prior/{object}.tsv"
     conda:
         "../../envs/training.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=by_photos(8000, 1000, 80, masked_photos),
-        runtime=lambda wildcards, attempt: 240 * attempt,
+        mem_mb=by_photos(4000, 1000, 80, masked_photos),
+        runtime=lambda wildcards, attempt: 60 * attempt,
         gpu=config["gpu"],
     params:
-        options=settings(
-            "object.stage1.epochs", "object.nerf.width_px", "object.hold_out_every"
-        ),
-        checkpoints="results/checkpoints/{object}/stage1",
-        seed=config["seed"],
-        script=script("nerf/train_depth.py"),
-        code=code("nerf/train_depth.py"),
+        options=settings("object.nerf.width_px", "object.hold_out_every"),
+        script=script("nerf/estimate_depth_prior.py"),
+        code=code("nerf/estimate_depth_prior.py"),
     message:
-        "{wildcards.object}: stage 1, depth network"
+        "{wildcards.object}: stage 1, depth prior"
     shell:
         "exec python {params.script} --workspace {input.workspace} --masks {input.masks} --stage {output.stage} --report {output.report}"
-        " --checkpoints {params.checkpoints}/{params.code} --seed {params.seed} {params.options} &> {log}"
+        " {params.options} &> {log}"
 
 
 rule refine_depth:

@@ -8,7 +8,7 @@
 #           results/summary/paper.tsv, paper.html    the paper's Tables 2 to 4, beside the run that config names: evaluation.paper
 
 
-ruleorder: estimate_as_paper > train_depth
+ruleorder: estimate_as_paper > estimate_depth_prior
 ruleorder: refine_as_paper > refine_depth
 ruleorder: train_nerf_as_paper > train_object_nerf
 ruleorder: retrain_nerf_as_paper > retrain_object_nerf

@@ -1,28 +1,29 @@
-"""Stage 1's photos, cut to the object and as tensors, and the depth that its network starts from.
+"""Stage 1 of an object: depth of every photo by stereo and from SfM points, moved to where photos match, and confirmed
+by other views."""
 
-First depths lie between SfM points, and are measured by stereo (M7).
-"""
-
+import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from scenefuse.cloud.cloud_file import NEIGHBOURS
-from scenefuse.core.stage import StageError
+from scenefuse.core.machine import use_threads
+from scenefuse.core.stage import StageError, atomic_directory, quantity, threads, value, write_json
+from scenefuse.core.transforms import Array
 from scenefuse.geometry.surface import ends_of
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.sparse_depths import beside_mask, own_points, pair_worth
-from scenefuse.nerf.monodepth import disparity_from_depth, points_in_cam
-from scenefuse.photos.views import Views
+from scenefuse.nerf.rendered_maps import MAP_AGREEMENT, confirm, write_prior
+from scenefuse.photos.views import Views, load_views
 from scenefuse.photos.workspace import View
 
-# Every tenth SfM point is kept from training, to measure with.
-CHECK_EVERY = 10
+# Stereo sees photos cut to the object, about this many pixels squared.
+CROP_PX = 144
 # The depth range is widened at both ends by this share of it.
 RANGE_MARGIN = 0.15
 # Kept around a mask's box, share of the box: windows and warps at the outline need pixels beyond it.
@@ -32,6 +33,51 @@ STEREO = DepthMapSettings(sources=6, best_sources=2, window_px=5)
 # Matching score at which stereo and SfM points count the same.
 EVEN_SCORE = 0.3
 Map = NDArray[np.float32]
+
+
+def estimate_depth_prior(
+    *,
+    workspace: Path,
+    masks: Path,
+    stage: Path,
+    report: Path,
+    width_px: int,
+    hold_out_every: int,
+    crop_px: int = CROP_PX,
+    map_agreement: float = MAP_AGREEMENT,
+) -> None:
+    """Write a depth map for each photo of one object.
+
+    Depths are along z, in object units, 0 off the object: by stereo where photos match, between SfM points elsewhere,
+    then moved to where photos match at full size, and marked by which other views confirm them (methods N10, N4).
+
+    Args:
+        workspace: undistorted COLMAP workspace of the object.
+        masks: folder of masks named like the photos, .png.
+        stage: output folder: depth_maps/{photo}.bin and confidence_maps/{photo}.bin (0..1).
+        report: output JSON: photos, shares of the depths that photos moved, contradicted, confirmed, seconds.
+        width_px: width of the depth maps, that of the NeRF's photos.
+        hold_out_every: every n-th photo helps no other photo's depth; 0 holds out none.
+        crop_px: pixels squared of the photos cut to the object.
+        map_agreement: two depths of one place agree within this share of the object's diagonal.
+
+    Raises:
+        StageError: no photo with a mask, fewer than three photos, or fewer than eight SfM points on the object.
+    """
+    start = time.monotonic()
+    use_threads(threads())
+    views = load_views(workspace, masks, width_px, hold_out_every)
+    crops = crop_to_object(views, crop_px)
+    known = points_on_object(crops.views, STEREO.sources)
+    depths = np.zeros(views.masks.shape, np.float32)
+    for index, (place, (height, width)) in enumerate(zip(depths, views.sizes.tolist())):
+        place[:height, :width] = crops.paste(index, first_depth(crops.views, known, index))
+    prior, shares = confirm(views, depths, map_agreement=map_agreement)
+    with atomic_directory(stage) as folder:
+        write_prior(folder, views, prior)
+    content = {"photos": quantity(len(views.names), "1"), **shares}
+    write_json(report, content | {"seconds": quantity(round(time.monotonic() - start, 1), "s")})
+    print(f"depth maps written: {value(content, 'confirmed_share'):.0%} of the object confirmed by other views")
 
 
 @dataclass(frozen=True)
@@ -71,8 +117,7 @@ def crop_to_object(views: Views, crop_px: int) -> Crops:
     aspect = float(np.median(extent[:, 0] / extent[:, 1]))
     ideal = np.array([crop_px * aspect**0.5, crop_px / aspect**0.5])
     largest = np.minimum(np.minimum(ideal, extent.max(0)), [width, height])
-    # The network halves its maps four times.
-    canvas = np.maximum(np.ceil(largest / 4) * 4, 2 * 2**4).astype(int)
+    canvas = np.maximum(np.ceil(largest / 4) * 4, 32).astype(int)
     pictures: tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8]]] = ([], [])
     intrinsics, moves = [], []
     for index, box in enumerate(boxes):
@@ -111,89 +156,55 @@ def _window(image: NDArray, corner: NDArray, canvas: NDArray) -> NDArray:
 
 
 @dataclass(frozen=True)
-class DepthPhotos:
-    """The V photos of an object as tensors.
+class ObjectPoints:
+    """The SfM points on an object, and what they say of its V photos.
 
     Attributes:
-        images: (V, 3, H, W) in 0..1.
-        masks: (V, 1, H, W) zeros and ones.
-        intrinsics: (V, 3, 3).
-        object_from_cam: (V, 4, 4).
-        trained: (V,) bool, False for held-out photos.
-        sources: (V, S) indices of the photos each photo is compared with, best first, never held out.
-        points: V float32 arrays (N, 3): column, row (pixels) and depth of the SfM points on the object.
-        checks: as `points`: every tenth SfM point, never shown to the network, to measure with.
-        near: nearest depth the network can say, object units.
-        far: farthest.
-        diagonal: diagonal of the box around the object's SfM points, object units.
+        ids: V arrays of the points that each photo observes on the object.
+        pixels: V float32 arrays (N, 3): their column, row (pixels) and depth (object units).
+        sources: (V, S) indices of the photos that each photo is matched with, best first, never held out.
+        near, far: depths between which the surface is, object units.
     """
 
-    images: Tensor
-    masks: Tensor
-    intrinsics: Tensor
-    object_from_cam: Tensor
-    trained: NDArray[np.bool_]
-    sources: Tensor
-    points: list[NDArray[np.float32]]
-    checks: list[NDArray[np.float32]]
+    ids: list[NDArray[np.int64]]
+    pixels: list[NDArray[np.float32]]
+    sources: NDArray[np.int64]
     near: float
     far: float
-    diagonal: float
-
-    def source_from_target(self, target: Tensor, source: Tensor) -> Tensor:
-        """(..., 4, 4) SfM transforms between photos given by index, broadcast against each other."""
-        return torch.linalg.inv(self.object_from_cam[source]) @ self.object_from_cam[target]
 
 
-def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhotos:
-    """Turn Views into tensors, find the depth range, and choose the source photos.
+def points_on_object(views: Views, sources: int) -> ObjectPoints:
+    """The SfM points that photos observe in their masks, the depth range, and at most so many sources of each photo.
 
     Raises:
-        StageError: fewer than three photos to train on, or fewer than eight SfM points on the object.
+        StageError: fewer than three photos to match with, or fewer than eight SfM points on the object.
     """
     if (~views.held_out).sum() < 3:
         raise StageError(
             f"only {(~views.held_out).sum()} photos with a mask can be trained on; depth needs at least 3: "
             "take more photos around the object, or set object.hold_out_every to 0"
         )
-    seen = _points_on_object(views)
-    on_object = np.unique(np.concatenate([ids for ids, _ in seen]))
+    own, ids, pixels = own_points(views), [], []
+    for index, track in enumerate(views.tracks):
+        rows, on_mask, _, place, depth = beside_mask(views, index, track)
+        kept = on_mask & own[rows]
+        ids.append(rows[kept])
+        pixels.append(np.column_stack([place, depth])[kept].astype(np.float32))
+    on_object = np.unique(np.concatenate(ids))
     if len(on_object) < 8:
         raise StageError(
             f"only {len(on_object)} SfM points lie on the object in all photos; depth needs at least 8: "
             "check that the masks show the object, and that the photos are sharp"
         )
-    low, high = ends_of(views.sparse[on_object])
-    depths = np.concatenate([pixels[:, 2] for _, pixels in seen])
-    closest, farthest = ends_of(depths)
+    closest, farthest = ends_of(np.concatenate([place[:, 2] for place in pixels]))
     margin = RANGE_MARGIN * (farthest - closest) + 1e-3 * farthest  # a range of its own where all depths are equal
-
-    def as_tensor(array: NDArray[np.generic]) -> Tensor:
-        return torch.as_tensor(array, dtype=torch.float32, device=device)
-
-    return DepthPhotos(
-        as_tensor(views.images).permute(0, 3, 1, 2).contiguous() / 255.0,
-        as_tensor(views.masks)[:, None],
-        as_tensor(views.intrinsics),
-        as_tensor(views.object_from_cam),
-        ~views.held_out,
-        torch.as_tensor(_choose_sources(views, [ids for ids, _ in seen], sources), device=device),
-        [pixels[ids % CHECK_EVERY != 0] for ids, pixels in seen],
-        [pixels[ids % CHECK_EVERY == 0] for ids, pixels in seen],
+    return ObjectPoints(
+        ids,
+        pixels,
+        _choose_sources(views, ids, sources),
         float(max(closest - margin, 0.2 * closest)),
         float(farthest + margin),
-        float(np.linalg.norm(high - low)),
     )
-
-
-def _points_on_object(views: Views) -> list[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-    """For each photo the SfM points of the object that it observes in its mask, and their column, row and depth."""
-    own, seen = own_points(views), []
-    for index, track in enumerate(views.tracks):
-        rows, on_mask, _, pixels, depth = beside_mask(views, index, track)
-        kept = on_mask & own[rows]
-        seen.append((rows[kept], np.column_stack([pixels, depth])[kept].astype(np.float32)))
-    return seen
 
 
 def _choose_sources(views: Views, seen: list[NDArray[np.int64]], count: int) -> NDArray[np.int64]:
@@ -209,74 +220,39 @@ def _choose_sources(views: Views, seen: list[NDArray[np.int64]], count: int) -> 
     return np.argsort(-worth, axis=1, kind="stable")[:, : min(count, available)]
 
 
-@dataclass(frozen=True)
-class NetworkInputs:
-    """What the depth network is given of V photos.
-
-    Attributes:
-        channels: (V, 9, H, W): colour (3), mask, ray (2), disparity between SfM points, disparity by stereo, its score.
-        first: (V, 1, H, W) disparity that the network corrects.
-    """
-
-    channels: Tensor
-    first: Tensor
+def first_depth(views: Views, known: ObjectPoints, index: int) -> Map:
+    """(H, W) depth of a photo: inverse depths by stereo and between SfM points, weighted by stereo's score."""
+    between = _between_points(views, known, index)
+    reference, *sources = (_gray(views, row) for row in (index, *known.sources[index].tolist()))
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    found = estimate_depth(reference, sources, known.near, known.far, STEREO, device)
+    score = found.score.clip(0, 1) ** 4
+    swept = 1 / found.best.clip(known.near, known.far)
+    return (1 / (between + score / (score + EVEN_SCORE**4) * (swept - between))).astype(np.float32)
 
 
-def network_inputs(photos: DepthPhotos, settings: DepthMapSettings | None = STEREO) -> NetworkInputs:
-    """The network's input channels and the disparity it starts from.
-
-    Args:
-        photos: the photos.
-        settings: of the stereo; None leaves it out.
-    """
-    count, _, height, width = photos.images.shape
-    flat = torch.full((count, 1, height, width), 0.5, device=photos.images.device)
-    ray = points_in_cam(torch.ones_like(flat), photos.intrinsics)[:, :2].view(count, 2, height, width)
-    between = torch.cat([_between_points(photos, index) for index in range(count)])
-    swept, score = flat, torch.zeros_like(flat)
-    if settings is not None:
-        pairs = [_swept(photos, index, settings) for index in range(count)]
-        swept, score = torch.cat([d for d, _ in pairs]), torch.cat([s for _, s in pairs])
-    weight = (score**4) / (score**4 + EVEN_SCORE**4)
-    first = between + weight * (swept - between)
-    colour = (photos.images * 2.0 - 1.0) * photos.masks
-    channels = torch.cat([colour, photos.masks * 2 - 1, ray, between * 2 - 1, swept * 2 - 1, score], 1)
-    return NetworkInputs(channels, first)
-
-
-def _between_points(photos: DepthPhotos, index: int) -> Tensor:
-    """(1, 1, H, W) disparity: inverse-distance mean of the nearest SfM points, with outliers left out."""
-    height, width = photos.images.shape[2:]
-    points = photos.points[index]
+def _between_points(views: Views, known: ObjectPoints, index: int) -> Array:
+    """(H, W) inverse depth of a photo: inverse-distance mean of the nearest SfM points, with outliers left out."""
+    height, width = views.masks.shape[1:]
+    points = known.pixels[index]
     if len(points) < 3:
-        middle = np.median(np.concatenate([p[:, 2] for p in photos.points]))
+        middle = np.median(np.concatenate([pixels[:, 2] for pixels in known.pixels]))
         points = np.array([[width / 2, height / 2, middle]], dtype=np.float32)
-    disparity = disparity_from_depth(torch.from_numpy(points[:, 2]), photos.near, photos.far).numpy()
+    inverse = 1 / points[:, 2].astype(np.float64).clip(known.near, known.far)
     tree = cKDTree(points[:, :2])
-    around = disparity[tree.query(points[:, :2], min(NEIGHBOURS, len(points)))[1].reshape(len(points), -1)]
-    off = np.abs(disparity - np.median(around, axis=1))
-    keep = off <= 4.0 * np.median(off) + 0.02
+    around = inverse[tree.query(points[:, :2], min(NEIGHBOURS, len(points)))[1].reshape(len(points), -1)]
+    off = np.abs(inverse - np.median(around, axis=1))
+    keep = off <= 4.0 * np.median(off) + 0.02 * (1 / known.near - 1 / known.far)
     rows, columns = np.indices((height, width)).reshape(2, -1) + 0.5
     near_by = min(NEIGHBOURS, int(keep.sum()))
     distance, neighbour = cKDTree(points[keep, :2]).query(np.column_stack([columns, rows]), near_by)
     distance, neighbour = distance.reshape(-1, near_by), neighbour.reshape(-1, near_by)
     weight = 1.0 / (distance**2 + 1.0)
-    value = (disparity[keep][neighbour] * weight).sum(1) / weight.sum(1)
-    return torch.from_numpy(value.astype(np.float32)).view(1, 1, height, width).to(photos.images.device)
+    return ((inverse[keep][neighbour] * weight).sum(1) / weight.sum(1)).reshape(height, width)
 
 
-def _swept(photos: DepthPhotos, index: int, settings: DepthMapSettings) -> tuple[Tensor, Tensor]:
-    """(1, 1, H, W) disparity by stereo and its score in 0..1."""
-    device = photos.images.device
-    reference, *sources = (_gray(photos, row) for row in (index, *photos.sources[index][: settings.sources].tolist()))
-    found = estimate_depth(reference, sources, photos.near, photos.far, settings, str(device))
-    depth, score = (torch.from_numpy(maps)[None, None].to(device) for maps in (found.best, found.score))
-    return disparity_from_depth(depth, photos.near, photos.far), score.clamp(0.0, 1.0)
-
-
-def _gray(photos: DepthPhotos, index: int) -> View:
-    """A photo in grey."""
-    pixels = photos.images[index].mean(0).cpu().numpy()
-    intrinsics = photos.intrinsics[index].double().cpu().numpy()
-    pose = np.linalg.inv(photos.object_from_cam[index].double().cpu().numpy())
-    return View(str(index), intrinsics, pose, pixels.shape[1], pixels.shape[0], pixels)
+def _gray(views: Views, index: int) -> View:
+    """A cut photo in grey, (H, W) float32 in 0..1."""
+    pose = np.linalg.inv(views.object_from_cam[index])
+    pixels = views.images[index].mean(2, dtype=np.float32) / np.float32(255)
+    return View(str(index), views.intrinsics[index], pose, pixels.shape[1], pixels.shape[0], pixels)

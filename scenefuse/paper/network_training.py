@@ -1,4 +1,4 @@
-"""Training the depth network on the photos of one object; a killed training resumes where it stopped."""
+"""Training depth and pose networks on the photos of one object; a killed training resumes where it stopped."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,26 +20,22 @@ from scenefuse.core.checkpoints import (
 )
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, threads
-from scenefuse.nerf.monodepth import (
+from scenefuse.paper.depth_photos import DepthPhotos
+from scenefuse.paper.monodepth import (
     DepthNetwork,
     depth_from_disparity,
-    masked_mean,
     minimum_reprojection,
     photometric_error,
-    sample,
-    smoothness,
     warp,
 )
-from scenefuse.nerf.prior_inputs import DepthPhotos, NetworkInputs
 
 # Highest rate of Adam. Gradients are clipped, since single photos can be off by much.
 LEARNING_RATE = 1e-3
 MAX_GRADIENT = 1.0
-SOURCES_PER_STEP = 3
 # Weight of equation (5) as in Monodepth2; the other losses have 1.
 SMOOTHNESS_WEIGHT = 1e-3
-# Relative depth errors are squared below the first of these, and count no more beyond the second.
-SQUARED_ERROR, MAX_ERROR = 0.005, 0.1
+# Relative depth errors are squared below this.
+SQUARED_ERROR = 0.005
 
 # The losses of (B,) chosen photos at a step, by name; the generator draws what is random.
 Objective = Callable[[Tensor, int, torch.Generator], dict[str, Tensor]]
@@ -52,14 +48,12 @@ class Recipe:
     Attributes:
         epochs: each shows every photo once.
         warmup_epochs: epochs of linear rise of the learning rate before the cosine.
-        batch_photos: target photos per step.
-        even: whether an epoch's batches are as large as each other, not all but the last one full.
+        batch_photos: target photos per step; an epoch's last batch holds the rest.
     """
 
     epochs: int
     warmup_epochs: int = 2
     batch_photos: int = 24
-    even: bool = True
 
     def steps(self, photos: DepthPhotos) -> int:
         """Steps of the whole training."""
@@ -73,38 +67,6 @@ def prepare_torch(seed: int) -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def train_network(
-    network: DepthNetwork, photos: DepthPhotos, inputs: NetworkInputs, recipe: Recipe, checkpoint: Path, seed: int
-) -> list[dict[str, float]]:
-    """Train the depth network in place on photos of known poses and return one row of mean losses per epoch.
-
-    Batches and sources depend on the seed and the step only, so a resumed run equals an uninterrupted one.
-
-    Raises:
-        StageError: the training diverged.
-    """
-    points, weights = _padded(photos)
-    # Half of the training compares photos at half size, where wrong depths still find their way.
-    scales, steps = [PhotoScale(photos, shrink) for shrink in (2, 1)], recipe.steps(photos)
-
-    def losses(chosen: Tensor, step: int, generator: torch.Generator) -> dict[str, Tensor]:
-        scale = scales[step * len(scales) // steps]
-        disparity = network(inputs.channels[chosen], inputs.first[chosen])
-        depth = depth_from_disparity(disparity, photos.near, photos.far)
-        available = photos.sources.shape[1]
-        columns = torch.randperm(available, generator=generator)[: min(SOURCES_PER_STEP, available)].sort().values
-        sources = photos.sources[chosen][:, columns]
-        moves = photos.source_from_target(chosen[:, None], sources)
-        error, counts = reprojection_error(scale, chosen, sources, depth, moves, scale.unmoved[chosen][:, columns])
-        return {
-            "photometric": masked_mean(error, counts),
-            "smoothness": smoothness(disparity, photos.images[chosen], photos.masks[chosen]),
-            "anchor": _anchor(depth, points[chosen], weights[chosen]),
-        }
-
-    return optimise({"depth": network}, photos, losses, recipe, checkpoint, seed)
-
-
 def optimise(
     networks: dict[str, nn.Module],
     photos: DepthPhotos,
@@ -113,7 +75,13 @@ def optimise(
     checkpoint: Path,
     seed: int,
 ) -> list[dict[str, float]]:
-    """Minimise an objective by Adam, with warm-up and cosine; arguments, result and errors as of `train_network`."""
+    """Train networks in place by Adam, with warm-up and cosine, and return one row of mean losses per epoch.
+
+    Batches depend on the seed and the step only, so a resumed run equals an uninterrupted one.
+
+    Raises:
+        StageError: the training diverged.
+    """
     batches = _batches(np.flatnonzero(photos.trained), recipe, seed)
     steps, warmup = len(batches), len(batches) * recipe.warmup_epochs / max(recipe.epochs, 1)
     parameters = [weight for network in networks.values() for weight in network.parameters()]
@@ -201,34 +169,17 @@ def reprojection_error(
     return smallest, counts & (scale.masks[chosen] > 0)
 
 
-def _anchor(depth: Tensor, points: Tensor, weights: Tensor) -> Tensor:
-    """Huber loss on the relative depth error at SfM points."""
-    relative = sample(depth, points[..., :2])[:, 0] / points[..., 2] - 1.0
-    return (huber(relative, MAX_ERROR) * weights).sum() / weights.sum().clamp_min(1.0)
-
-
-def huber(relative: Tensor, largest: float) -> Tensor:
-    """Absolute error, squared below SQUARED_ERROR and flat above `largest`."""
-    size = relative.abs().clamp_max(largest)
-    return functional.huber_loss(size, torch.zeros_like(size), reduction="none", delta=SQUARED_ERROR) / SQUARED_ERROR
-
-
-def _padded(photos: DepthPhotos) -> tuple[Tensor, Tensor]:
-    """(V, N, 3) SfM points of all photos and (V, N) weights, zero for padding."""
-    count, most = len(photos.points), max(1, *(len(p) for p in photos.points))
-    points, weights = np.ones((count, most, 3), np.float32), np.zeros((count, most), np.float32)
-    for index, p in enumerate(photos.points):
-        points[index, : len(p)], weights[index, : len(p)] = p, 1.0
-    device = photos.images.device
-    return torch.from_numpy(points).to(device), torch.from_numpy(weights).to(device)
+def huber(relative: Tensor) -> Tensor:
+    """Absolute error, squared below SQUARED_ERROR."""
+    nothing = torch.zeros_like(relative)
+    return functional.huber_loss(relative, nothing, reduction="none", delta=SQUARED_ERROR) / SQUARED_ERROR
 
 
 def _batches(photos: NDArray[np.int64], recipe: Recipe, seed: int) -> list[NDArray[np.int64]]:
     """Indices of the photos of each step: every epoch shows all of them in a new order."""
     rng = np.random.default_rng(seed)
-    number = -(-len(photos) // recipe.batch_photos)
-    parts = number if recipe.even else recipe.batch_photos * np.arange(1, number)
-    return [batch for _ in range(recipe.epochs) for batch in np.array_split(rng.permutation(photos), parts)]
+    ends = np.arange(recipe.batch_photos, len(photos), recipe.batch_photos)
+    return [batch for _ in range(recipe.epochs) for batch in np.split(rng.permutation(photos), ends)]
 
 
 def _by_epoch(losses: list[dict[str, float]], epochs: int) -> list[dict[str, float]]:
