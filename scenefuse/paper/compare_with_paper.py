@@ -18,17 +18,15 @@ import yaml
 
 from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.core.job_records import JobRecords
-from scenefuse.core.stage import StageError, atomic_file, read_json, setting, value
-from scenefuse.core.transforms import Sim3, fit_sim3
-from scenefuse.photos.workspace import posed_images, read_model
+from scenefuse.core.stage import StageError, atomic_file, read_json, setting
+from scenefuse.core.transforms import Sim3
 from scenefuse.register.score import AgreementSettings, registration_metrics
 from scenefuse.report.run_summary import ObjectSummary, RunInputs, summarise
 from scenefuse.report.values import Fields, find, load, number
 
 PAPER, HERE, SCENEFUSE = "paper (published, its own data)", "paper preset (here)", "scenefuse"
-COMMON = "scenefuse, on the preset's crop"
 NULL = "null"
-_HEADINGS = (PAPER, HERE, SCENEFUSE, COMMON, NULL)
+_HEADINGS = (PAPER, HERE, SCENEFUSE, NULL)
 VARIANTS = ("full", "no_scale", "no_crop")
 """The registration of the paper's Tables 2 and 3, and those of its ablation, Table 4."""
 ASSETS = importlib.resources.files("scenefuse.paper") / "assets"
@@ -94,10 +92,7 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
             PAPER: Column(published(item.name), measured=False),
             HERE: column_of(item),
             SCENEFUSE: without(why) if why else column_of(other),
-            COMMON: Column(measured=False),
         }
-        if not why and (between := between_scenes(run.scenes[scene], beside.scenes[scene])) is not None:
-            columns[COMMON] = on_crop_of(folder, item, its_folder, between)
         null = null_of(folder, item, seed)
         if null is None and not why and (null := null_of(its_folder, other, seed)) is not None:
             null = replace(null, notes=dict.fromkeys(VARIANTS, "on the crop of the run scenefuse"))
@@ -144,25 +139,6 @@ def why_not_comparable(pairs: list[tuple[Path, Path]], item: ObjectSummary, othe
     if here is not None and there is not None and not math.isclose(here, there, rel_tol=1e-6):
         return f"{pairs[0][1]} is measured at another tau ({there:.4g} of the crop's diagonal, here {here:.4g})"
     return ""
-
-
-def between_scenes(own: Path, other: Path) -> Sim3 | None:
-    """From another run's scene to this run's, of the same photos, by their cameras; of the same cloud, nothing moves.
-    None where there are too few cameras.
-
-    Args:
-        own: this run's folder of the scene.
-        other: the other run's.
-    """
-    models = [folder / "georeferenced" for folder in (own, other)]
-    if not all(model.is_dir() for model in models):
-        return None if any(model.is_dir() for model in models) else Sim3.identity()
-    here, there = ({image.name: image.projection_center() for image in posed_images(read_model(m))} for m in models)
-    names = sorted(here.keys() & there.keys())
-    try:
-        return fit_sim3(np.array([there[name] for name in names]), np.array([here[name] for name in names]))
-    except ValueError:
-        return None
 
 
 def _taken_from(folder: Path) -> Any:
@@ -286,26 +262,6 @@ def null_of(folder: Path, item: ObjectSummary, seed: int) -> Column | None:
     random = np.random.default_rng(seed).uniform(crop.points.min(0), crop.points.max(0), (count, 3))
     found = registration_metrics(Cloud(random), crop, Sim3.identity(), tau, diagonal["value"], diagonal["unit"])
     return Column(_cells(dict.fromkeys(VARIANTS, found | _measured(fields, "_null"))))
-
-
-def on_crop_of(folder: Path, item: ObjectSummary, its_folder: Path, here_from_there: Sim3) -> Column:
-    """What another run's pose gives on this run's crop, by this run's tau: the same part of the scene for both.
-
-    Args:
-        folder: this run's results of the object, with registration/full/crop.ply.
-        item: what was collected of them.
-        its_folder: the other run's, with object.ply and a pose in registration/full/fine.json.
-        here_from_there: from the other run's scene to this run's.
-    """
-    fields = item.variants.get("full", {})
-    tau, diagonal = find(fields, "metrics.registration.tau"), fields.get("crop.diagonal")
-    pose = value(read_json(its_folder / "registration/full/fine.json"), "scene_from_object")
-    if tau is None or diagonal is None or pose is None:
-        return Column(measured=False)
-    crop, obj = read_cloud(folder / "registration/full/crop.ply"), read_cloud(its_folder / "object.ply")
-    moved = here_from_there @ Sim3.from_matrix(np.array(pose))
-    found = registration_metrics(obj, crop, moved, tau, diagonal["value"], diagonal["unit"])
-    return Column(_cells({"full": found}), measured=False)
 
 
 def _measured(fields: Fields, ending: str = "") -> Fields:

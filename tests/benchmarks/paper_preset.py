@@ -29,7 +29,6 @@ from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.metrics.evaluate import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import SAMPLES, registration_error, true_depth
 from scenefuse.paper.compare_with_paper import (
-    COMMON,
     NULL,
     OBJECTS,
     PAPER,
@@ -154,15 +153,6 @@ def of_tables(cells: dict[tuple[str, str], tuple[float, str]]) -> dict[str, Any]
     }
 
 
-def on_presets_crop(preset: Path, name: str) -> dict[str, Any]:
-    """The shipped run's numbers on the crop of a run of the preset, as its paper.tsv has them."""
-    path = preset / "summary/paper.tsv"
-    if not path.is_file():
-        return {}
-    table = pd.read_csv(path, sep="\t", na_values="-").query("object == @name").dropna(subset=COMMON)
-    return of_tables({(row.measure, row.variant): (row[COMMON], "") for _, row in table.iterrows()})
-
-
 def of_chance(run: Run) -> dict[str, Any]:
     """The paper's tables' measures of nothing, on the crop of a run."""
     crop = run.folder / "registration/full/crop.ply"
@@ -240,7 +230,6 @@ def paper_preset(
         columns |= {column: found.measures() for column, found in runs.items()}
         columns[NULL] = of_chance(runs[SHIPPED]) | of_chance_in_stages(runs[SHIPPED], runs[CHAINED])
         columns |= {null: of_chance(runs[column]) for column, null in NULLS.items()}
-        columns[COMMON] = on_presets_crop(from_sfm, name)
         measures = dict.fromkeys(key for column in (FROM_SFM, *columns) for key in columns[column])
         for measure in measures:
             row = {column: _five_digits(cells.get(measure)) for column, cells in columns.items()}

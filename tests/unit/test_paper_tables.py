@@ -8,12 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.job_records import JobRecords
-from scenefuse.core.stage import quantity, value, write_json
-from scenefuse.core.transforms import Sim3, rotation_between
+from scenefuse.core.stage import quantity, write_json
 from scenefuse.paper.compare_with_paper import (
-    COMMON,
     HERE,
     NULL,
     OBJECTS,
@@ -21,13 +19,10 @@ from scenefuse.paper.compare_with_paper import (
     PUBLISHED,
     SCENEFUSE,
     ComparisonSettings,
-    between_scenes,
     compare_with_paper,
     paper_section,
     published,
 )
-from scenefuse.photos.workspace import View, write_model
-from scenefuse.register.score import registration_metrics
 from scenefuse.report.run_summary import RunInputs
 from scenefuse.report.values import load
 from scenefuse.report.write_report import write_report
@@ -35,7 +30,6 @@ from scenefuse.report.write_report import write_report
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("house", "shed")
 OWN, SHIPPED = "paper/results", "results"
-OBJECT_AND_CROP = f"{SHIPPED}/objects/house/object.ply", f"{OWN}/objects/house/registration/full/crop.ply"
 STAGES = ("matches", "sparse", "undistorted", "masks", "stage2", "stage3", "stage4", "object", "alignment")
 COMPLETION = {"surface_variation": 0.1, "nue": 1.5, "nue_density_invariant": 1.2, "primitive_fitting_score": 0.8}
 
@@ -146,36 +140,6 @@ def test_each_number_stands_in_its_column_and_row(folder):
     )
     assert table["preset"].eq(said).all()
     assert table.groupby("measure")["definition"].nunique().eq(1).all() and table["definition"].str.len().min() > 20
-
-
-def test_the_shipped_pose_is_also_measured_on_the_preset_s_crop(folder):
-    obj, crop = (read_cloud(folder / place) for place in OBJECT_AND_CROP)
-    expected = registration_metrics(obj, crop, Sim3(8.0, np.eye(3), np.zeros(3)), 0.16, 10.0, "m")
-    table = compared(folder)
-    for name in ("fitness", "inlier_rmse", "normal_consistency"):
-        row = table.loc[("house", 2, "full", name)]
-        assert row[COMMON] == pytest.approx(value(expected, name), rel=1e-4) and row[COMMON] != row[SCENEFUSE]
-    assert table.loc[("house", 4), COMMON].isna().all() and table.loc[("house", 3), COMMON].isna().all()
-
-
-def test_the_scenes_of_two_runs_are_brought_together_by_their_cameras(folder):
-    between = Sim3(1.01, rotation_between(np.array([0, 0, 1.0]), np.array([0, 0.1, 1.0])), np.array([3.0, -2, 0.5]))
-    for results, moved in ((OWN, between), (SHIPPED, Sim3.identity())):
-        views = []
-        for k, centre in enumerate(np.random.default_rng(0).normal(size=(5, 3))):
-            pose = np.eye(4)
-            pose[:3, 3] = -moved.apply(centre[None])[0]
-            views.append(View(f"{k}.jpg", np.diag([50.0, 50, 1]), pose, 80, 60))
-        (folder / results / "scenes/yard/georeferenced").mkdir()
-        write_model(folder / results / "scenes/yard/georeferenced", views)
-    scenes = [folder / results / "scenes/yard" for results in (OWN, SHIPPED)]
-    found = between_scenes(*scenes)
-    assert np.allclose(found.matrix, between.matrix, atol=1e-9)
-    obj, crop = (read_cloud(folder / place) for place in OBJECT_AND_CROP)
-    expected = registration_metrics(obj, crop, between @ Sim3(8.0, np.eye(3), np.zeros(3)), 0.16, 10.0, "m")
-    assert compared(folder).loc[("house", 2, "full", "fitness"), COMMON] == pytest.approx(value(expected, "fitness"))
-    shutil.rmtree(scenes[0] / "georeferenced")
-    assert between_scenes(*scenes) is None and np.isnan(compared(folder).loc[("house", 2, "full", "fitness"), COMMON])
 
 
 def test_only_objects_of_the_paper_have_published_numbers(folder):
@@ -364,7 +328,6 @@ def test_the_page_says_which_variant_a_note_is_about():
         PAPER: "-",
         HERE: "1",
         SCENEFUSE: "2",
-        COMMON: "-",
         NULL: "-",
     }
     places = [("2", "full", "fitness"), ("3", "full", "nue"), ("4", "no_crop", "fitness"), ("4", "no_crop", "tau")]
