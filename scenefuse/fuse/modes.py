@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, sampled_rows, spacing, voxel_downsample, within
+from scenefuse.cloud.clouds import Cloud, sampled_rows, spacing, within
 from scenefuse.cloud.tiled_cloud import Rows
 from scenefuse.core.stage import setting, threads
 from scenefuse.core.transforms import Array, Sim3
@@ -44,8 +44,6 @@ class FusionSettings:
     """`evidence` checks the points of both sides in the photos of both and keeps what these confirm. For comparison,
     `fill` adds the object points that the scene lacks, `append` all of them, and `replace` puts the object in the place
     of the scene's points on it."""
-    density: float = setting(0, least=0)
-    """Spacing of the added points over the scene's; 0 keeps every point."""
     match_colors: bool = setting(True)
     """Whether the object's colours get a gain and bias per channel from the overlap."""
     nerf_only: bool = setting(False)
@@ -142,13 +140,13 @@ def fuse_by_evidence(
     near = scene[rows]
     checked = check(obj, near, obj_photos, scene_photos, settings.nerf_only, certain, on_world)
     step = spacing(near.points)
-    moved, gain, bias = with_colors_of(checked.obj, near, SAME_PLACE_SPACINGS * step, settings.match_colors)
-    added = thinned(moved[checked.added], settings.density * step)
-    added = feathered(added, near[checked.reason == Reason.KEPT], SEAM_SPACINGS * step, SAME_PLACE_SPACINGS * step)
+    fill = SAME_PLACE_SPACINGS * step
+    moved, gain, bias = with_colors_of(checked.obj, near, fill, settings.match_colors)
+    added = feathered(moved[checked.added], near[checked.reason == Reason.KEPT], SEAM_SPACINGS * step, fill)
     whole = unchecked(scene)
     for name, values in whole.fields.items():
         values[rows] = checked.scene.fields[name]
-    return Fused(whole, rows, checked.reason, added, gain, bias, SAME_PLACE_SPACINGS * step), checked
+    return Fused(whole, rows, checked.reason, added, gain, bias, fill), checked
 
 
 def around(scene: Cloud, obj: Cloud) -> NDArray[np.bool_]:
@@ -258,27 +256,10 @@ def fuse_by_distance(obj: Cloud, scene: Cloud, part: Cloud, pose: Sim3, settings
         moved = moved[distance > fill]
     elif settings.mode == "replace":
         removed = near[within(scene.points[near], moved.points, fill)]
-    added = thinned(moved, settings.density * step)
     if settings.mode != "append":
-        added = feathered(added, scene[np.setdiff1d(near, removed)], SEAM_SPACINGS * step, fill)
+        moved = feathered(moved, scene[np.setdiff1d(near, removed)], SEAM_SPACINGS * step, fill)
     reason = np.full(len(removed), Reason.REPLACED, np.uint8)
-    return Fused(unchecked(scene), removed, reason, unchecked(added), gain, bias, fill)
-
-
-def thinned(cloud: Cloud, wanted: float) -> Cloud:
-    """Thin a cloud to a median spacing of `wanted`; one that is sparser already stays as it is, and any with 0."""
-    if wanted <= 0 or len(cloud) <= 10 or spacing(cloud.points) >= wanted:
-        return cloud
-    low, high = 0.3 * wanted, 2.0 * wanted
-    best = cloud
-    for _ in range(8):
-        middle = float(np.sqrt(low * high))
-        best = voxel_downsample(cloud, middle)
-        if len(best) < 10 or spacing(best.points) > wanted:
-            high = middle
-        else:
-            low = middle
-    return best
+    return Fused(unchecked(scene), removed, reason, unchecked(moved), gain, bias, fill)
 
 
 def color_notes(fused: Fused, obj: Cloud, scene: Cloud) -> tuple[Fused, list[str]]:

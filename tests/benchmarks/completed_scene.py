@@ -50,8 +50,6 @@ SCALES = (1.03, 1 / 1.03)
 ALIGNED, ALIGNMENTS = 20_000, 20
 # Of the scene near the object, to time the fusion.
 COST_POINTS = (1_000_000, 10_000_000)
-# The modes that are shown at the scene's spacing and at the object's own; any other has its own density.
-THINNED = ("fill", "append", "replace")
 # Rows that are no fusion.
 BEFORE, ALONE = "scene before", "object alone"
 F_SCORES = [f"f_score_{ending}" for ending in THRESHOLDS]
@@ -119,12 +117,9 @@ def fusions(modes: tuple[str, ...]) -> dict[str, FusionSettings]:
     """Every mode that there is, or those wanted, by the name of its row."""
     found = {}
     for mode in get_args(get_type_hints(FusionSettings)["mode"]):
-        if mode not in THINNED:
-            found[mode] = FusionSettings(mode=mode)
-            found[f"{mode}, nerf_only"] = FusionSettings(mode=mode, nerf_only=True)
-            continue
-        for density, name in ((1, "the scene's density"), (0, "its own density")):
-            found[f"{mode}, {name}"] = FusionSettings(mode=mode, density=density)
+        found[mode] = FusionSettings(mode=mode)
+        if mode == "evidence":
+            found["evidence, nerf_only"] = FusionSettings(mode=mode, nerf_only=True)
     if unknown := set(modes) - set(found):
         raise StageError(f"there are no rows {sorted(unknown)}; there are {', '.join(found)}")
     return {name: settings for name, settings in found.items() if not modes or name in modes}

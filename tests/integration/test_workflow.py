@@ -117,7 +117,7 @@ def test_an_edited_setting_reruns_only_what_depends_on_it(finished, snakemake, t
         *("compute_metrics", "compute_scene_metrics", "evaluate_object"),
     }
     tiny = yaml.safe_load((ROOT / "tests/data/tiny.yaml").read_text())
-    (tmp_path / "edited.yaml").write_text(yaml.safe_dump(tiny | {"fusion": {"density": 2.0}}))
+    (tmp_path / "edited.yaml").write_text(yaml.safe_dump(tiny | {"fusion": {"match_colors": False}}))
     assert planned(snakemake(finished, "--dry-run", config=tmp_path / "edited.yaml").stdout) == rules | SUMMARY
 
 
