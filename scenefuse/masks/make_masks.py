@@ -27,7 +27,7 @@ from scenefuse.marks.clicks import read_points
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.prompts import overlap
 from scenefuse.masks.sam2 import Sam2, load_network
-from scenefuse.masks.sam2_weights import why_unavailable
+from scenefuse.masks.sam2_weights import WEIGHTS, why_unavailable
 from scenefuse.masks.segmentation import MaskSettings, Prompted, ScoredMasks, masks_from_prompts, score_masks
 from scenefuse.masks.target import target_from_points
 from scenefuse.masks.votes import points_in_masks
@@ -79,7 +79,7 @@ def make_masks(
         seed: seed of the ground's RANSAC.
         masks: output folder, {photo without suffix}.png, uint8 0 or 255, the size of the undistorted photo.
         contact_sheet: output PNG, all masks over their photos.
-        report: output JSON: method, weights, area and agreement per photo, photos left out and why.
+        report: output JSON: method, area and agreement per photo, photos left out and why.
 
     Raises:
         StageError: prompts, weights or masks are missing or wrong; too few good masks.
@@ -116,7 +116,7 @@ def make_masks(
 def _make(
     inputs: MaskInputs, photos: Workspace, settings: MaskSettings, seed: int
 ) -> tuple[ScoredMasks, Prompted, dict[str, Any]]:
-    """Masks of all photos that have one, what they were made from, and by which method and weights."""
+    """Masks of all photos that have one, what they were made from, and by which method."""
     up = np.array(value(read_json(inputs.workspace_json), "up_in_camera_frame"), dtype=np.float64)
     unusable: dict[str, str] = {}
     by = {"method": quantity(settings.method, "")}
@@ -175,20 +175,17 @@ def _with_disputed(made: ScoredMasks, found: Prompted, min_photos: int) -> tuple
 
 
 def _network(settings: MaskSettings) -> tuple[Sam2 | None, dict[str, Any]]:
-    """SAM 2, or None for GrabCut; and for the report which of them, with what weights, and why not the better one."""
-    encoder, decoder = Path(settings.sam2_encoder), Path(settings.sam2_decoder)
-    checkpoint = Path(settings.sam2_checkpoint) if settings.sam2_checkpoint else None
+    """SAM 2, or None for GrabCut; and for the report which of them, and why not the better one."""
     if settings.method == "grabcut":
         return None, {"method": quantity("grabcut", "")}
-    if settings.method == "auto" and checkpoint is None and (why := why_unavailable(encoder, decoder)):
+    if settings.method == "auto" and (why := why_unavailable()):
         fallback = (
-            f"masks by GrabCut, since SAM 2's weights could not be fetched ({why}); delete {encoder.parent} and run"
+            f"masks by GrabCut, since SAM 2's weights could not be fetched ({why}); delete {WEIGHTS} and run"
             " again to try once more"
         )
         print(fallback, flush=True)
         return None, {"method": quantity("grabcut", ""), "fallback": quantity(fallback, "")}
-    network, weights = load_network(encoder, decoder, checkpoint, threads())
-    return network, {"method": quantity("sam2", ""), "weights": quantity(weights, "")}
+    return load_network(threads()), {"method": quantity("sam2", "")}
 
 
 def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Workspace, dict[str, str]]:

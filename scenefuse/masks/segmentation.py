@@ -21,7 +21,6 @@ from scenefuse.masks.grabcut import along_edges, cleaned, first_cuts, query_grab
 from scenefuse.masks.prompts import BOX_GROWTH_SHARE, Measure, Segmenter, agreement
 from scenefuse.masks.propagation import propagate
 from scenefuse.masks.sam2 import SIDE_PX, Sam2, query_sam2, segment
-from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
@@ -53,13 +52,6 @@ class MaskSettings:
     """What the masks keep: `object`, or an expression with folders of other masks in quotes, `and`, `or`, `not` and
     brackets. `{object}` in a folder stands for the object's name. Masks are named like the photos; a photo without one
     shows nothing of that."""
-    sam2_encoder: str = ENCODER
-    """For sam2: weights of the encoder (.ort or .onnx), which a rule fetches."""
-    sam2_decoder: str = DECODER
-    """For sam2: weights of the decoder (.onnx), likewise."""
-    sam2_checkpoint: str | None = setting(None)
-    """For sam2: folder of a SAM 2 checkpoint that transformers runs instead of the weights above, on a GPU where there
-    is one (`pip install transformers==5.23.0`); nothing is downloaded."""
     min_agreement: float = 0.6
     """Smallest IoU of a mask with the hull's outline; below it the photo is left out."""
     max_click_residual_px: float = setting(4, unit="px", least=0)

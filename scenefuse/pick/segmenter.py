@@ -69,13 +69,11 @@ class Segmenter:
                 return
             if settings["method"] in ("auto", "sam2"):
                 from scenefuse.masks.sam2 import load_network, query_sam2
-                from scenefuse.masks.sam2_weights import DECODER, ENCODER, WEIGHTS, UnavailableError
+                from scenefuse.masks.sam2_weights import WEIGHTS, UnavailableError
 
-                checkpoint = settings["sam2_checkpoint"]
                 try:
-                    if checkpoint is None:
-                        self._fetch_once(Path(WEIGHTS))
-                    network, _ = load_network(Path(ENCODER), Path(DECODER), checkpoint and Path(checkpoint), threads())
+                    self._fetch_once(Path(WEIGHTS))
+                    network = load_network(threads())
                     self._network, network.kept = network, KEPT_PHOTOS
                     self._ask, self.method = partial(query_sam2, network), "SAM 2"
                     return

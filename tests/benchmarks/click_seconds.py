@@ -12,7 +12,7 @@ import numpy as np
 from scenefuse.core.stage import run
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.propagation import one_photo
-from scenefuse.masks.sam2 import Sam2Onnx, query_sam2
+from scenefuse.masks.sam2 import Sam2, query_sam2
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.photos.pictures import read_rgb
 from scenefuse.photos.workspace import View
@@ -31,7 +31,7 @@ def click_seconds(*, photo: Path, weights: Path, clicks: int = 5, threads: int =
     """
     pixels = read_rgb(photo)
     height, width = pixels.shape[:2]
-    network = Sam2Onnx(weights / "encoder.ort", weights / "decoder.onnx", threads)
+    network = Sam2(weights / "encoder.ort", weights / "decoder.onnx", threads)
     network.encode(pixels)
     view = View(photo.name, np.eye(3), np.eye(4), width, height, pixels)
     places = np.random.default_rng(0).uniform(1 / 3, 2 / 3, (clicks, 2)) * [width, height]

@@ -105,7 +105,7 @@ def clicked_masks(
     settings = build(MaskSettings, shipped["object"]["masks"] | {"method": method})
     thing, network = _read(folder, truth, wrong), None
     if method == "sam2":
-        network = Remembering(load_network(Path(settings.sam2_encoder), Path(settings.sam2_decoder), None, 1)[0])
+        network = Remembering(load_network(1))
     names = sorted(thing.truth)
     rows, how = [], PromptSettings(inside=3 if box else 5, box=box)
     with_stereo_points = cache(partial(segmentation.with_stereo_points, thing.photos))

@@ -3,9 +3,8 @@
 make check-gpu, or, on a machine with PyTorch, Triton and a GPU where nothing is installed:
 PYTHONPATH=.:tests python3 tests/benchmarks/gpu.py --table gpu.tsv --object results/objects/house --lego data/lego
 
-Beside PyTorch and Triton it needs NumPy, SciPy, Numba, OpenCV, PyYAML, jsonschema and tyro; pycolmap and pyproj
-for photos, transformers for SAM 2. Without a GPU both sides run on the CPU, which checks the checks, and the end is an
-error.
+Beside PyTorch and Triton it needs NumPy, SciPy, Numba, OpenCV, PyYAML, jsonschema and tyro; pycolmap and pyproj for
+photos. Without a GPU both sides run on the CPU, which checks the checks, and the end is an error.
 """
 
 import dataclasses
@@ -91,7 +90,6 @@ def gpu(
         "stereo": stereo,
         "photo_refinement": photo_refinement,
         "paper_networks": paper_networks,
-        "sam2": sam2,
     }
     if object is not None:
         checks["object"] = lambda: whole_object(object)
@@ -318,29 +316,6 @@ def paper_networks() -> Row:
     here, cpu, there, gpu_s = both(losses)
     note = f"photometric loss {here[0]:.4f}, {there[0]:.4f}; after twenty steps {here[1]:.4f}, {there[1]:.4f}"
     return Row("", "", abs(here[0] - there[0]) / here[0], 0.01, cpu, gpu_s, note)
-
-
-def sam2() -> Row:
-    """SAM 2 by transformers, its weights random: share of the pixels of its masks that differ."""
-    from transformers import Sam2Config, Sam2Model
-
-    from scenefuse.masks.sam2 import Sam2Transformers
-
-    photo = (sphere_views(1, 640)[0][0]).astype(np.uint8)
-
-    with tempfile.TemporaryDirectory() as name:
-        torch.manual_seed(0)
-        Sam2Model(Sam2Config()).save_pretrained(name)
-
-        def step() -> Any:
-            network = Sam2Transformers(Path(name))
-            start = time.perf_counter()
-            found = network.masks(network.encode(photo), photo.shape[:2], np.array([[320.0, 320.0]]), None)
-            return *found, time.perf_counter() - start
-
-        here, _, there, _ = both(step)
-    off = float(np.mean([np.mean(a != b) for a, b in zip(here[0], there[0])]))
-    return Row("", "", off, 0.01, here[2], there[2], "")
 
 
 def whole_object(folder: Path) -> Row:

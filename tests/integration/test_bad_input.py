@@ -45,7 +45,6 @@ def test_weights_are_fetched_only_where_the_masks_may_need_them(project, snakema
     project.photos("close")
     project.scenes, project.objects = "scene\tphotos\n", HEADER + "shed\t\tclose\t\tprompts.tsv\t\t\n"
     (project.path / "prompts.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t1.jpg\t20\t20\n")
-    project.path.joinpath("own").mkdir()
 
     def fetches(**masks):
         project.config["object"] = {"masks": masks}
@@ -54,7 +53,7 @@ def test_weights_are_fetched_only_where_the_masks_may_need_them(project, snakema
         return "fetch_sam2_weights" in planned(result.stdout)
 
     assert fetches() and fetches(method="sam2")
-    assert not fetches(method="grabcut") and not fetches(sam2_checkpoint="own")
+    assert not fetches(method="grabcut")
     # As the clicking page leaves them.
     (project.path / "results/weights/sam2").mkdir(parents=True)
     assert not fetches()

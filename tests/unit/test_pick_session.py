@@ -227,7 +227,7 @@ def test_a_box_that_makes_a_mask_worse_is_left_out_and_that_is_said(ball):
 def test_without_weights_grabcut_takes_their_place_and_the_page_says_so(ball, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "results/weights/sam2").mkdir(parents=True)
-    segmenter = Segmenter(GRABCUT | {"method": "sam2", "sam2_checkpoint": None}, 1600)
+    segmenter = Segmenter(GRABCUT | {"method": "sam2"}, 1600)
     segmenter.load()
     assert segmenter.method == "GrabCut" and "encoder.ort do not exist" in segmenter.trouble
 
@@ -235,7 +235,7 @@ def test_without_weights_grabcut_takes_their_place_and_the_page_says_so(ball, tm
 def test_weights_that_cannot_be_fetched_leave_nothing_behind_and_the_page_says_so(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NPM_CONFIG_REGISTRY", (tmp_path / "none").as_uri())
-    settings = {"method": "auto", "sam2_checkpoint": None}
+    settings = {"method": "auto"}
     segmenter = Segmenter(GRABCUT | settings, 1600)
     segmenter.load()
     assert segmenter.method == "GrabCut" and "No such file" in segmenter.trouble

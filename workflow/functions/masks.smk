@@ -29,10 +29,7 @@ def mask_inputs(wildcards):
             f"{config['objects']}: '{wildcards.object}' has neither prompts nor masks; fill one of these columns"
         )
     check_clicks(wildcards.object, "prompts")
-    by_network = settings["method"] in ("auto", "sam2")
-    if by_network and settings["sam2_checkpoint"]:
-        files += sorted(glob.glob(f"{settings['sam2_checkpoint']}/*"))
-    elif by_network:
+    if settings["method"] in ("auto", "sam2"):
         files.append(WEIGHTS)
     return files + own_file("object", wildcards.object, "prompts")
 

@@ -22,7 +22,7 @@ from scenefuse.geometry.visual_hull import Mask, mask_iou
 from scenefuse.marks.clicks import Clicks, read_points
 from scenefuse.masks.make_masks import supplied_masks
 from scenefuse.masks.prompts import NO_PIXELS
-from scenefuse.masks.sam2 import Sam2Onnx
+from scenefuse.masks.sam2 import Sam2
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.masks.segmentation import MaskSettings, masks_from_prompts, score_masks
 from scenefuse.photos.frames import original_sizes
@@ -42,8 +42,8 @@ class Cached:
         self._last: tuple[str, Any] = ("", None)
 
     @cached_property
-    def _network(self) -> Sam2Onnx:
-        return Sam2Onnx(Path(ENCODER), Path(DECODER), 1)
+    def _network(self) -> Sam2:
+        return Sam2(Path(ENCODER), Path(DECODER), 1)
 
     def encode(self, image: Any) -> tuple[str, Any]:
         """The photo and its key; it is encoded when a prompt has no answer yet."""
