@@ -6,6 +6,7 @@ The words are made of a row of scenes.tsv or objects.tsv, for the report page an
 
 import math
 from collections.abc import Collection, Mapping
+from datetime import date
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -15,10 +16,11 @@ import yaml
 from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.core.version import VERSION
 from scenefuse.photos.photo_files import open_picture
 from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.report.run_summary import ALONE, ObjectSummary
-from scenefuse.report.values import asset, find, length, percent, read_table
+from scenefuse.report.values import asset, find, length, percent, percents, read_table, records
 
 Row = Mapping[str, Any]
 # Photos of a scene whose ground pixels and dates are looked at, spread evenly.
@@ -42,35 +44,45 @@ def object_facts(row: Row) -> dict[str, str]:
     if status in DONE:
         why = WORDS["decided_by"].get(has.get("decided_by", ""))
     facts["Result"] = WORDS["results"][status] + (f": {why}" if why else "")
-    if status == ALONE:
-        facts["File"] = f"results/objects/{has['object']}/object.ply"
     if status == "unregistered":
         facts["Result"] += ". Perhaps it is not in this scene, or too little of it"
     if "height" in has:
         sides = " × ".join(length(has[side], unit) for side in ("length", "width"))
         facts["Size"] = f"{sides}, {length(has['height'], unit)} high"
     if "surface_missing" in has:
-        share = has["surface_missing"]
-        kinds = [
-            f"{percent(has[f'surface_{n}'])} {what}" for n, what in WORDS["missing"].items() if has.get(f"surface_{n}")
-        ]
-        facts["Surface"] = f"{percent(1 - share)} is there" + (
-            f", {percent(share)} is missing: {', '.join(kinds)}" if kinds else ""
-        )
+        lacks = {what: has.get(f"surface_{name}", 0.0) for name, what in WORDS["missing"].items()}
+        there, missing, *kinds = percents([1 - has["surface_missing"], *lacks.values()])
+        causes = ", ".join(f"{share} {what}" for what, share in zip(lacks, kinds) if share)
+        facts["Surface"] = f"{there} is there" + (f", {missing} is missing: {causes}" if missing else "")
         if has.get("ground_missing"):
             facts["Surface"] += f"; of the ground at its foot {percent(has['ground_missing'])} is missing"
-    if "added_points" in has:
-        facts["Points"] = f"{has['added_points']:,.0f} added" + (
-            f", {has['removed_points']:,.0f} of the scene removed" if has.get("removed_points") else ""
-        )
-        if "measured_share" in has:
-            facts["Points"] += f"; {percent(has['measured_share'])} of the object's are confirmed by photos"
-    facts |= {"Accuracy": found[0]} if (found := accuracies(row)) else {}
+    if found := accuracies(row):
+        absolute = "; that is relative: on Earth it is known as well as the scene (see Position)"
+        facts["Accuracy"] = found[0] + (absolute if "crs" in has else "")
+    if "scale_sd_log" in has:
+        of_scene = has.get("scene_scale_sd_log")
+        known = _of_lengths(math.hypot(has["scale_sd_log"], of_scene or 0.0), unit)
+        facts["Lengths"] = known + (", plus the deviation of both ends" if of_scene else ", beside the scene's")
     if "registered" in has and "frames" in has:
         facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used"
+        facts["Photos"] += f", taken {has['photographed']}" if "photographed" in has else ""
+    folder = f"results/objects/{has['object']}"
     if "added_points" in has:
-        facts["File"] = f"results/objects/{has['object']}/fused.ply, with its surroundings"
+        facts["File"] = f"{folder}/fused.ply with its surroundings ({_local(unit)})"
+    elif status == ALONE:
+        facts["File"] = f"{folder}/object.ply (a frame of its own, {unit})"
     return _capital(facts | _next(has))
+
+
+def _local(unit: str) -> str:
+    """The frame of all files of a scene that are not in its CRS."""
+    return f"local frame, {'metres' if unit == 'm' else unit}"
+
+
+def _of_lengths(scale_sd: float, unit: str) -> str:
+    """How well lengths are known whose scale has this relative standard deviation."""
+    ten = f", {length(10 * scale_sd, 'm')} in 10 m (standard deviation)" if unit == "m" else ""
+    return f"known to {percent(scale_sd)}{ten}"
 
 
 def is_current(made: Path, source: Path) -> bool:
@@ -78,17 +90,21 @@ def is_current(made: Path, source: Path) -> bool:
     return made.is_file() and source.is_file() and made.stat().st_mtime >= source.stat().st_mtime
 
 
-def surface_facts(folder: Path) -> dict[str, str]:
-    """The same of the surface in an object's results; nothing where none was made of its last fusion."""
+def surface_facts(folder: Path, unit: str = "m") -> dict[str, str]:
+    """The same of the surface in an object's results, in the scene's unit; nothing where none was made of its last
+    fusion."""
     if not is_current(folder / "surface.json", folder / "fused.ply"):
         return {}
     found = read_json(folder / "surface.json")
     if value(found, "status") == "empty":
         return {"Mesh": f"None: {value(found, 'reason')}"}
-    shares = ", ".join(f"{percent(value(found, kind))} {what}" for kind, what in WORDS["mesh"].items())
-    drawn = is_current(folder / "drawings/drawings.pdf", folder / "surface.json")
-    drawings = f", results/objects/{folder.name}/drawings/drawings.pdf" if drawn else ""
-    return {"Mesh": f"With the ground around it {shares}; results/objects/{folder.name}/surface.glb{drawings}"}
+    place = f"results/objects/{folder.name}"
+    mesh = f"{place}/surface.ply ({_local(unit)}), {place}/surface.glb (the same, metres, y up)"
+    if bridged := value(found, "bridged_area"):
+        mesh += f"; {bridged:.2g} {found['bridged_area']['unit'].replace('2', '²')} of it {WORDS['bridged']}"
+    if not is_current(folder / "drawings/drawings.pdf", folder / "surface.json"):
+        return {"Mesh": mesh}
+    return {"Mesh": mesh, "Drawings": f"{place}/drawings/drawings.pdf, to scale; above.tif beside it is in the CRS"}
 
 
 def accuracies(row: Row) -> list[str]:
@@ -134,9 +150,6 @@ def scene_facts(row: Row) -> dict[str, str]:
         facts["Result"] = f"completed with {has['completed_by']}; {has['completed_points']:,.0f} points"
     elif "points" in has:
         facts["Result"] = f"{has['points']:,.0f} points, not completed with all objects yet"
-    if "latitude_deg" in has:
-        north, east = has["latitude_deg"], has["longitude_deg"]
-        facts["Place"] = f"{abs(north):.5f}° {'NS'[north < 0]}, {abs(east):.5f}° {'EW'[east < 0]}"
     photos = "given as a cloud"
     if "registered" in has and "photos" in has:
         photos = f"{has['registered']:.0f} of {has['photos']:.0f} photos used"
@@ -145,15 +158,20 @@ def scene_facts(row: Row) -> dict[str, str]:
         facts["Coordinates"] = f"metres, {_crs_name(has['crs'])}" if "crs" in has else "metres, in a local frame"
     else:
         facts["Coordinates"] = "scene units: neither GPS, control points nor known lengths give metres"
+    if "latitude_deg" in has:
+        north, east = has["latitude_deg"], has["longitude_deg"]
+        place = f"{abs(north):.5f}° {'NS'[north < 0]}, {abs(east):.5f}° {'EW'[east < 0]}"
+        facts["Place"] = f"{place}; from there the local frame counts metres east, north and up"
+    if found := accuracies(row):
+        facts["Position"] = f"{found[0]}: absolute, where on Earth the scene lies"
+    if "gps_scale_sd_log" in has:
+        facts["Lengths"] = f"{_of_lengths(has['gps_scale_sd_log'], unit)}, by the photos' GPS"
     if "ground_pixel" in has:
         facts["Ground pixel"] = f"{length(has['ground_pixel'], unit)}, what a pixel of a photo covers on the ground"
-    facts |= {"Accuracy": found[0]} if (found := accuracies(row)) else {}
-    if "gps_scale_sd_log" in has and "control_rms_horizontal_m" not in has:
-        facts["Lengths"] = f"known to {percent(has['gps_scale_sd_log'])} by the photos' GPS"
     if "completed_points" in has:
         file = f"results/scenes/{has['scene']}/completed"
         facts["File"] = f"{file}.copc.laz" + (
-            f" in these coordinates; {file}.ply from a local origin" if "crs" in has else f", {file}.ply"
+            f" in these coordinates; {file}.ply in the local frame" if "crs" in has else f", {file}.ply"
         )
     return _capital(facts)
 
@@ -169,6 +187,14 @@ def _errors(what: str, horizontal_m: float, vertical_m: float) -> list[str]:
     le90 = length(NormalDist().inv_cdf(0.95) * vertical_m, "m")
     rms = f"{length(horizontal_m, 'm')} horizontally and {length(vertical_m, 'm')} vertically"
     return [f"{what} {rms} off (root mean square)", f"nine of ten less than {ce90} (CE90) and {le90} (LE90)"]
+
+
+def made_by(summary: Path) -> str:
+    """By what, when and, if scenes.tsv says so, by whom the results were made."""
+    file = summary / "scenes.tsv"
+    day = date.fromtimestamp(file.stat().st_mtime) if file.is_file() else date.today()
+    who = dict.fromkeys(_known(row).get("made_by") for row in records(read_table(file)))
+    return f"Made by {', '.join(filter(None, [*who, f'scenefuse {VERSION}']))} on {day}."
 
 
 def closing_lines(summary: Path) -> str:
@@ -201,20 +227,21 @@ def closing_lines(summary: Path) -> str:
     )
 
 
-def photographed(scene: Path) -> str | None:
-    """The day of a scene's photos by their EXIF, or the first and the last day; None where it is not known.
+def photographed(photos_json: Path, folder: Path) -> str | None:
+    """The day of some photos by their EXIF, or the first and the last day; None where it is not known.
 
     Args:
-        scene: the scene's results, with photos.json and photos/.
+        photos_json: lists them.
+        folder: holds them.
     """
     try:
-        names = [photo["name"] for photo in read_json(scene / "photos.json").get("photos", [])]
+        names = [photo["name"] for photo in read_json(photos_json).get("photos", [])]
     except StageError:
         return None
     days = set()
     for name in names[:: max(1, len(names) // LOOKED_AT)]:
         try:
-            with open_picture(scene / "photos" / name) as image:
+            with open_picture(folder / name) as image:
                 exif = image.getexif()
                 taken = exif.get_ifd(IFD.Exif).get(Base.DateTimeOriginal) or exif.get(Base.DateTime)
         except StageError:

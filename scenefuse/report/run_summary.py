@@ -56,6 +56,8 @@ class RunInputs:
     """What of each scene was given; photos of all where this is empty."""
     given_objects: tuple[Given, ...] = ()
     """What of each object was given, likewise."""
+    made_by: tuple[str, ...] = ()
+    """Who makes the results of each scene; nobody is named where this is empty."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import json
 import math
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +96,18 @@ def percent(share: float) -> str:
     rest = min(value, 100 - value)
     digits = 0 if rest >= 10 or rest <= 0 else 1 if rest >= 0.1 else 2
     return f"{value:.{digits}f} %"
+
+
+def percents(parts: Sequence[float]) -> list[str]:
+    """The first share of a whole, the sum of the others, and these, in per cent that sum to 100; "" for none."""
+    digits = 1 if sum(parts[1:]) >= 0.001 else 2
+    whole = 10 ** (digits + 2)
+    exact = [whole * part / (sum(parts) or 1.0) for part in parts]
+    counts = [math.floor(part) for part in exact]
+    # What rounding down leaves goes to the largest remainders.
+    for at in sorted(range(len(parts)), key=lambda at: counts[at] - exact[at])[: whole - sum(counts)]:
+        counts[at] += 1
+    return [f"{100 * n / whole:.{digits}f} %" if n else "" for n in (counts[0], sum(counts[1:]), *counts[1:])]
 
 
 def length(value: float, unit: str) -> str:

@@ -1,8 +1,8 @@
-"""The report on paper: two A4 pages an object and one a scene, of the records that the page is made of."""
+"""The report on paper: an overview, then two A4 pages an object, of the records that the page is made of."""
 
 import logging
-from datetime import date
 from pathlib import Path
+from textwrap import shorten
 
 import matplotlib
 import numpy as np
@@ -12,8 +12,9 @@ from PIL import Image
 
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.version import VERSION
-from scenefuse.report.facts import object_facts, scene_facts, surface_facts
+from scenefuse.report.facts import WORDS, made_by, object_facts, scene_facts, surface_facts
 from scenefuse.report.values import length, read_table, records
+from scenefuse.surface.gltf import metres_per_unit
 
 GAP_MM = 4
 SIDES = ("south", "east", "north", "west")
@@ -22,7 +23,7 @@ SIDES = ("south", "east", "north", "west")
 def write_pdf(
     *, summary: Path, scenes: tuple[Path, ...] = (), objects: tuple[Path, ...] = (), title: str = "", report: Path
 ) -> None:
-    """Write what a client keeps: an object's facts and pictures, its four sides to one scale, its scene.
+    """Write what a client keeps: an overview, and an object's facts, pictures and four sides to scale.
 
     Args:
         summary: folder with the summary's TSV files.
@@ -34,21 +35,27 @@ def write_pdf(
     of_object, of_scene = (
         {row[kind]: row for row in records(read_table(summary / f"{kind}s.tsv"))} for kind in ("object", "scene")
     )
-    page = _Page(title or Path.cwd().name)
-    below = f"{page.project}, {date.fromtimestamp((summary / 'objects.tsv').stat().st_mtime)}"
-    for folder in objects:
-        name = folder.name
-        page.start(name, below)
-        page.facts(object_facts(of_object.get(name, {"object": name, "status": "missing"})) | surface_facts(folder))
+    rows = [of_object.get(folder.name, {"object": folder.name, "status": "missing"}) for folder in objects]
+    facts = [object_facts(row) | surface_facts(folder, row.get("unit", "m")) for folder, row in zip(objects, rows)]
+    page = _Page(title or Path.cwd().name, made_by(summary))
+    page.start(page.project, page.made)
+    for folder in scenes:
+        page.text_line(f"Scene {folder.name}", 12)
+        page.facts(scene_facts(of_scene.get(folder.name, {"error": "not run yet"})))
+    page.text_line("Objects", 12)
+    verdicts = [WORDS["badges"].get(row["status"], row["status"]) for row in rows]
+    found = [[each.get("Size", "-"), shorten(each.get("Surface", each["Result"]), 150)] for each in facts]
+    page.rows([[f.name, verdict, *more] for f, verdict, more in zip(objects, verdicts, found)], (3, 3, 7, 12))
+    for folder in scenes:
+        page.pictures([folder / "scene.png"], [f"scene {folder.name}, its cameras and their errors"])
+    for folder, each in zip(objects, facts):
+        page.start(folder.name, page.made)
+        page.facts(each)
         page.pictures([folder / f"figures/{when}.png" for when in ("before", "after")], ["before", "after"])
-        page.start(name, "from four sides, to one scale")
+        page.start(folder.name, "what is missing, and the four sides")
         if (folder / "drawings/drawings.json").is_file():
             page.sides(folder / "drawings")
         page.pictures([folder / "figures/missing.png"], ["what is missing, and from where photos would show it"])
-    for folder in scenes:
-        page.start(f"Scene {folder.name}", below)
-        page.facts(scene_facts(of_scene.get(folder.name, {"error": "not run yet"})))
-        page.pictures([folder / "scene.png"], ["the scene, its cameras and their errors"])
     with atomic_file(report) as temporary:
         page.output(str(temporary))
 
@@ -56,46 +63,54 @@ def write_pdf(
 class _Page(FPDF):
     """A4 pages that begin with the project and end with who made them."""
 
-    def __init__(self, project: str) -> None:
+    def __init__(self, project: str, made: str) -> None:
         super().__init__()
         logging.getLogger("fontTools").setLevel(logging.ERROR)
         fonts = Path(matplotlib.get_data_path()) / "fonts/ttf"
         self.add_font("sans", "", fonts / "DejaVuSans.ttf")
         self.add_font("sans", "B", fonts / "DejaVuSans-Bold.ttf")
-        self.project = project
+        self.project, self.made = project, made
         self.set_title(project)
         self.set_creator(f"scenefuse {VERSION}")
 
     def footer(self) -> None:
-        """The project, the version and the number of the page."""
+        """The project, its maker and the number of the page."""
         self.set_y(-self.l_margin)
         self.set_font("sans", size=7)
-        self.cell(0, 4, f"{self.project}, made by scenefuse {VERSION}", align="L")
+        self.cell(0, 4, f"{self.project}. {self.made}", align="L")
         self.cell(0, 4, f"{self.page_no()}", align="R")
 
     def start(self, name: str, below: str) -> None:
         """A new page of an object, and a line below its name."""
         self.add_page()
-        self.set_font("sans", "B", 16)
-        self.cell(0, 9, name, new_x="LMARGIN", new_y="NEXT")
+        self.text_line(name, 16)
         self.set_font("sans", size=9)
         self.cell(0, 6, below, new_x="LMARGIN", new_y="NEXT")
         self.ln(GAP_MM)
 
+    def text_line(self, text: str, size: int) -> None:
+        """A heading of this size."""
+        self.set_font("sans", "B", size)
+        self.cell(0, 0.55 * size, text, new_x="LMARGIN", new_y="NEXT")
+
     def facts(self, facts: dict[str, str]) -> None:
         """A table of labels and sentences."""
+        self.rows([list(pair) for pair in facts.items()], (1, 5))
+
+    def rows(self, rows: list[list[str]], widths: tuple[int, ...]) -> None:
+        """A table without a heading."""
         self.set_font("sans", size=9)
         self.set_line_width(0.1)
         with self.table(
             first_row_as_headings=False,
             borders_layout="HORIZONTAL_LINES",
-            col_widths=(1, 5),
+            col_widths=widths,
             text_align="LEFT",
             line_height=4.5,
             padding=0.7,
         ) as table:
-            for label, text in facts.items():
-                table.row([label, text])
+            for row in rows:
+                table.row(row)
         self.ln(GAP_MM)
 
     def pictures(self, paths: list[Path], captions: list[str]) -> None:
@@ -120,25 +135,28 @@ class _Page(FPDF):
         self.set_y(top + min(left, highest) + 2 * GAP_MM)
 
     def sides(self, drawings: Path) -> None:
-        """The four elevations to one scale, with a bar that says it."""
+        """The four elevations to one scale, which is said below them, beside a bar."""
         known = read_json(drawings / "drawings.json")
         unit, views = known["south_pixel"]["unit"], []
         for side in SIDES:
             with rasterio.open(drawings / f"{side}.tif") as file:
                 views.append((np.moveaxis(file.read(), 0, 2), value(known, f"{side}_pixel")))
         width, height = (max(v.shape[axis] * pixel for v, pixel in views) for axis in (1, 0))
-        cell = (self.epw - GAP_MM) / 2
-        scale = min(cell / width, 0.2 * self.eph / height)
-        top = self.get_y()
+        cell, mm = (self.epw - GAP_MM) / 2, 1000 * metres_per_unit(unit)
+        needed = mm * max(width / cell, height / (0.2 * self.eph))
+        power = 10.0 ** np.floor(np.log10(needed))
+        scale = max(1, round(next(k for k in (1, 1.5, 2, 2.5, 3, 4, 5, 7.5, 10) if k * power >= needed) * power))
+        per_unit, top = mm / scale, self.get_y()
         self.set_font("sans", size=8)
         for k, (side, (pixels, pixel)) in enumerate(zip(SIDES, views)):
             x = self.l_margin + k % 2 * (cell + GAP_MM)
-            y = top + k // 2 * (height * scale + 2 * GAP_MM)
-            self.image(Image.fromarray(pixels), x, y, pixels.shape[1] * pixel * scale)
-            self.text(x, y + height * scale + 3, f"from the {side}")
+            y = top + k // 2 * (height * per_unit + 2 * GAP_MM)
+            self.image(Image.fromarray(pixels), x, y, pixels.shape[1] * pixel * per_unit)
+            self.text(x, y + height * per_unit + 3, f"from the {side}")
         bar = 10.0 ** np.floor(np.log10(width / 2))
-        self.set_y(top + 2 * (height * scale + 2 * GAP_MM) + 2)
+        self.set_y(top + 2 * (height * per_unit + 2 * GAP_MM) + 2)
         self.set_line_width(1)
-        self.line(self.l_margin, self.get_y(), self.l_margin + bar * scale, self.get_y())
+        self.line(self.l_margin, self.get_y(), self.l_margin + bar * per_unit, self.get_y())
         self.ln(1)
-        self.cell(0, 5, f"{length(bar, unit)}; white: not measured", new_x="LMARGIN", new_y="NEXT")
+        ratio = "" if unit == "scene units" else f"1:{scale} on A4; "
+        self.cell(0, 5, f"{ratio}bar: {length(bar, unit)}; white: not measured", new_x="LMARGIN", new_y="NEXT")

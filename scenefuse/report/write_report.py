@@ -11,8 +11,7 @@ import pandas as pd
 import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.core.version import VERSION
-from scenefuse.report.facts import WORDS, accuracies, object_facts, scene_facts, surface_facts
+from scenefuse.report.facts import WORDS, made_by, object_facts, scene_facts, surface_facts
 from scenefuse.report.page import document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
 from scenefuse.report.values import asset, number, read_table, records
@@ -64,10 +63,9 @@ def write_report(
     )
     rows = [of_object.get(folder.name, {"object": folder.name, "status": "missing"}) for folder in objects]
     shown = list(zip(objects, rows))
-    exact = {name: accuracies(row) for name, row in (of_scene | of_object).items()}
-    links = "".join(f'<a href="#{escape(folder.name)}">{escape(folder.name)}</a>' for folder in objects)
+    links = "".join(f'<a href="#{escape(folder.name)}">{escape(folder.name)}</a>{_badge(row)}' for folder, row in shown)
     body = [
-        f"<header><h1>{escape(title)}</h1><p>{texts['intro']} Made by scenefuse {VERSION}.</p>",
+        f"<header><h1>{escape(title)}</h1><p>{escape(made_by(summary))} {texts['intro']}</p>",
         f"<nav>{links}</nav></header>",
         *(
             f'<section class="scene"><h2>Scene {escape(name)}</h2>{_facts(scene_facts(of_scene[name]))}</section>'
@@ -77,7 +75,6 @@ def write_report(
         *(_object_card(folder, row, views.get(folder / "figures"), texts) for folder, row in shown),
         *(_scene_card(folder, views.get(folder), texts) for folder in scenes if (folder / "scene.png").is_file()),
         '<section id="record"><h2>For the record</h2>',
-        _folded("Accuracy", _facts({name: "; ".join(found) for name, found in exact.items() if found}), "accuracy"),
         *(_object_record(folder, texts) for folder, row in shown if row["status"] not in UNFINISHED),
         *([] if paper is None else [_folded("The paper", _paper_section(paper), "compared")]),
         *(_table_section(name, table, **texts["tables"][name]) for name, table in tables.items()),
@@ -115,12 +112,11 @@ def _folded(title: str, content: str, key: str) -> str:
 
 def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str:
     """One object: result, picture before and after, facts, 3D view, what is missing, masks."""
-    status, word = row["status"], WORDS["badges"].get(row["status"], row["status"])
-    badge = f'<span class="badge {"ok" if status in ("registered", ALONE) else "no"}">{word}</span>'
-    parts = [f'<section class="card" id="{escape(folder.name)}"><h2>{escape(folder.name)}{badge}</h2>']
+    status = row["status"]
+    parts = [f'<section class="card" id="{escape(folder.name)}"><h2>{escape(folder.name)}{_badge(row)}</h2>']
     is_finished, figures = status not in UNFINISHED, folder / "figures"
     pictures = [_slider(figures)] if status in ADDED and (figures / "before.png").is_file() else []
-    facts = object_facts(row) | (surface_facts(folder) if is_finished else {})
+    facts = object_facts(row) | (surface_facts(folder, row.get("unit", "m")) if is_finished else {})
     parts.append(f'<div class="pair">{"".join(pictures)}{_facts(facts)}</div>')
     if view is not None and is_finished:
         mesh = read_mesh(folder, view.unit)
@@ -132,8 +128,16 @@ def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str
             _folded("What is missing", figure(figures / "missing.png", texts["missing"]), f"{folder.name}-missing")
         )
     if (folder / "masks.png").is_file():
-        parts.append(figure(folder / "masks.png", texts["masks"]))
+        content = figure(folder / "masks.png", texts["masks"])
+        parts.append(_folded("What was taken for the object in its photos", content, f"{folder.name}-masks"))
     return "\n".join([*parts, "</section>"])
+
+
+def _badge(row: Row) -> str:
+    """What became of an object in a word or two."""
+    status = row["status"]
+    kind = "ok" if status in ("registered", ALONE) else "no"
+    return f'<span class="badge {kind}">{WORDS["badges"].get(status, status)}</span>'
 
 
 def _slider(figures: Path) -> str:

@@ -5,7 +5,7 @@ import math
 import re
 import shutil
 import textwrap
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,14 @@ from scenefuse.report.facts import (
     diagnose,
     ground_pixel,
     is_current,
+    made_by,
     object_facts,
     photographed,
     scene_facts,
 )
 from scenefuse.report.forecast import FORECAST, read_forecast
 from scenefuse.report.run_summary import ObjectSummary, RunInputs, RunSummary, SceneSummary, summarise, why_missing
-from scenefuse.report.values import Fields, asset, find, number, parts_of, records, unit_of
+from scenefuse.report.values import Fields, asset, find, number, records, unit_of
 
 # Seconds of a rule's jobs: by the clock, of the processor, and as they were forecast.
 SECONDS = ("seconds", "processor_seconds", "forecast_seconds")
@@ -35,8 +36,6 @@ BESIDE = ("null", "before", "after")
 # Columns of the tables and lines of details.txt, and where each value stands.
 QUANTITIES: dict[str, dict[str, Any]] = yaml.safe_load(asset("quantities.yaml"))
 WIDTH = 100
-# Facts that the one screen of summary.txt leaves to the page.
-ON_PAGE_ONLY = {"Points", "Photos"}
 # Quantities of a stage that are worth a line: what it chose where it had a choice, and what it noted.
 CHOICES = ("pose_source", "backend", "method", "mode", "up_cue")
 NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")
@@ -48,7 +47,7 @@ Cell = tuple[str, Any, str]
 def write_summary(*, run: RunInputs, summary: Path) -> None:
     """Collect every stage JSON and benchmark into tables and a text that reads well in a terminal.
 
-    Writes registration.tsv, completion.tsv, runtime.tsv, scenes.tsv, objects.tsv, disk.tsv, details.txt and, last,
+    Writes registration.tsv, completion.tsv, runtime.tsv, scenes.tsv, objects.tsv, details.txt and, last,
     summary.txt.
     A value that does not exist is '-'. An object without results is named with the last error of its logs. What an
     earlier run left behind a step that failed since is not shown.
@@ -62,14 +61,13 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
         "registration": registration_table(found),
         "completion": completion_table(found),
         "runtime": runtime_table(run.jobs.benchmarks, read_forecast(run.jobs.logs / FORECAST)),
-        "scenes": scenes_table(found.scenes, run.scenes),
-        "objects": objects_table(found),
-        "disk": disk_table([*run.scenes, *run.objects]),
+        "scenes": scenes_table(found.scenes, run),
+        "objects": objects_table(found, run),
     }
     for name, table in tables.items():
         with atomic_file(summary / f"{name}.tsv") as temporary:
             table.to_csv(temporary, sep="\t", index=False, na_rep="-", float_format="%.8g")
-    texts = {"details": details_text(found, tables), "summary": summary_text(found, tables)}
+    texts = {"details": details_text(found, tables), "summary": summary_text(found, tables, made_by(summary))}
     for name, text in texts.items():
         with atomic_file(summary / f"{name}.txt") as temporary:
             temporary.write_text(text)
@@ -142,29 +140,21 @@ def runtime_table(benchmarks: Path, forecast: Mapping[str, float]) -> pd.DataFra
     return table
 
 
-def disk_table(folders: Sequence[Path]) -> pd.DataFrame:
-    """Disk space of the parts of result folders: name (such as `scenes/{scene}`), part, megabytes; largest first."""
-    rows = [
-        {"name": f"{folder.parent.name}/{folder.name}", "part": part, "megabytes": size / 1e6}
-        for folder in folders
-        for part, size in sorted(parts_of(folder).items(), key=lambda item: (-item[1], item[0]))
-    ]
-    return pd.DataFrame(rows, columns=["name", "part", "megabytes"])
-
-
-def scenes_table(scenes: list[SceneSummary], folders: Sequence[Path]) -> pd.DataFrame:
+def scenes_table(scenes: list[SceneSummary], inputs: RunInputs) -> pd.DataFrame:
     """One row a scene: photos, cameras, georeference, cloud, metrics of the completed scene, errors against truth.
 
     Args:
         scenes: what the run has left of them.
-        folders: their results.
+        inputs: of the run.
     """
     rows = []
-    for scene, folder in zip(scenes, folders):
+    for scene, folder, maker in zip(scenes, inputs.scenes, inputs.made_by or [""] * len(scenes), strict=True):
         fields, added = scene.fields, find(scene.fields, "completed.added_points")
-        row: dict[str, Any] = {"scene": scene.name} | _columns(fields, "scenes")
+        row: dict[str, Any] = {"scene": scene.name, "made_by": maker or None} | _columns(fields, "scenes")
         if "georeference.length_unit" in fields:
-            row |= {"photographed": photographed(folder), "ground_pixel": ground_pixel(folder / "georeferenced")}
+            row["photographed"] = photographed(folder / "photos.json", folder / "photos")
+            row["ground_pixel"] = ground_pixel(folder / "georeferenced")
+        row["gps_scale_sd_log"] = _scale_sd(fields)
         row["completed_by"] = None if added is None else ", ".join(added) or "none"
         for measure in (name for m in MEASURES for name in (m, *(f"{m}_{beside}" for beside in BESIDE))):
             if f"metrics.completion.{measure}" in fields:
@@ -176,10 +166,15 @@ def scenes_table(scenes: list[SceneSummary], folders: Sequence[Path]) -> pd.Data
     return pd.DataFrame(rows)
 
 
-def objects_table(run: RunSummary) -> pd.DataFrame:
+def _scale_sd(scene: Fields) -> float | None:
+    """How well the photos' GPS gives a scene's scale; None where nothing or control points give it."""
+    return None if "georeference.control_points" in scene else find(scene, "georeference.gps_scale_sd_log")
+
+
+def objects_table(run: RunSummary, inputs: RunInputs) -> pd.DataFrame:
     """One row an object: the result, its size (in `unit`), what is missing, what to do; cameras, stages, truth."""
-    rows = []
-    for item in run.objects:
+    rows, scenes = [], {scene.name: scene.fields for scene in run.scenes}
+    for item, folder, scene in zip(run.objects, inputs.objects, inputs.scene_of):
         variant = run.variants[0]
         fields = item.variants[variant] | item.fusion | item.stages
         unit, size = unit_of(fields, "metrics.object.size"), find(fields, "metrics.object.size") or [None] * 3
@@ -187,7 +182,10 @@ def objects_table(run: RunSummary) -> pd.DataFrame:
             {"object": item.name, "status": item.status(variant), "reason": item.reason(variant)}
             | dict(zip(("length", "width", "height"), size))
             | _columns(fields, "objects")
-            | {"unit": unit or unit_of(fields, "crop.diagonal")}
+            | {"unit": unit or unit_of(fields, "crop.diagonal"), "scene": scene or None}
+            | {"crs": find(scenes.get(scene, {}), "georeference.crs")}
+            | {"scene_scale_sd_log": _scale_sd(scenes.get(scene, {}))}
+            | {"photographed": photographed(folder / "photos.json", folder / "frames")}
             | {"missing": item.missing or None, "error": why_missing(item.failed) if item.missing else None}
             | {"advice": "; ".join(diagnose(item)) or None}
         )
@@ -212,21 +210,21 @@ def _measure(key: str) -> tuple[str, str]:
     return (name, column) if column in BESIDE else (key, "value")
 
 
-def summary_text(run: RunSummary, tables: dict[str, pd.DataFrame]) -> str:
+def summary_text(run: RunSummary, tables: dict[str, pd.DataFrame], made: str) -> str:
     """What a client asks of each scene and object, in a line or two each."""
     lines: list[str] = []
     for row in records(tables["scenes"]):
-        lines += _heading(f"scene {row['scene']}") + _fact_lines(scene_facts(row), ON_PAGE_ONLY)
+        lines += ["", f"scene {row['scene']}", *_fact_lines(scene_facts(row), most=2)]
     for row in records(tables["objects"]):
-        lines += _heading(f"object {row['object']}: {row['status']}") + _fact_lines(object_facts(row), ON_PAGE_ONLY)
+        lines += ["", f"object {row['object']}: {row['status']}", *_fact_lines(object_facts(row), most=2)]
     if run.failed:
-        lines += _heading("jobs that failed") + [line for job in run.failed for line in _line("", job)]
-    lines += _heading(_count(run.objects, run.variants[0]))
-    return "\n".join([*lines, "details.txt says what the stages measured and chose; report.html shows it all."]) + "\n"
+        lines += ["", "jobs that failed", *(line for job in run.failed for line in _line("", job))]
+    more = "details.txt says what the stages measured and chose; report.html shows it all."
+    return "\n".join([*lines, "", f"{_count(run.objects, run.variants[0])}. {made}", more]) + "\n"
 
 
-def _fact_lines(facts: dict[str, str], without: Collection[str] = ()) -> list[str]:
-    return [line for label, text in facts.items() if label not in without for line in _line(label, text)]
+def _fact_lines(facts: dict[str, str], most: int | None = None) -> list[str]:
+    return [line for label, text in facts.items() for line in _line(label, text, most)]
 
 
 def details_text(run: RunSummary, tables: dict[str, pd.DataFrame]) -> str:
@@ -255,9 +253,10 @@ def _heading(text: str) -> list[str]:
     return ["", text, "-" * min(len(text), WIDTH)]
 
 
-def _line(label: str, text: str) -> list[str]:
-    """`label   text`, wrapped, continuation lines indented."""
-    return textwrap.wrap(text, WIDTH, initial_indent=f"{label:<14}", subsequent_indent=" " * 14) if text else []
+def _line(label: str, text: str, most: int | None = None) -> list[str]:
+    """`label   text`, wrapped, continuation lines indented; `most` is how many lines there may be."""
+    wrapper = textwrap.TextWrapper(WIDTH, f"{label:<14}", " " * 14, max_lines=most, placeholder=" ... (details.txt)")
+    return wrapper.wrap(text)
 
 
 def _pairs(*cells: Cell) -> str:

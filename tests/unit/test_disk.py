@@ -3,7 +3,6 @@
 import os
 
 from scenefuse.report.values import parts_of
-from scenefuse.report.write_summary import disk_table
 
 
 def test_parts_are_counted_once_and_links_are_not(tmp_path):
@@ -16,9 +15,3 @@ def test_parts_are_counted_once_and_links_are_not(tmp_path):
     (house / ".figures.tmp-77").mkdir()
     (house / ".figures.tmp-77" / "a.png").write_bytes(bytes(10**6))
     assert parts_of(house) == {"fused.ply": 10**6, "stage2": 3 * 10**6}
-    table = disk_table([house, tmp_path / "objects" / "none"])
-    assert table.to_dict("list") == {
-        "name": ["objects/house"] * 2,
-        "part": ["stage2", "fused.ply"],
-        "megabytes": [3.0, 1.0],
-    }

@@ -338,11 +338,14 @@ QUESTIONS = {
     "what is missing?": r"2\.0 % is missing: 0\.9 % seen by no photo",
     "which CRS?": r"UTM zone 32N \(EPSG:25832\)",
     "when?": "2024-06-01",
+    "when were the close-ups taken?": "taken 2024-06-02",
     "how many photos?": "40 of 40 used",
-    "may I trust the scale?": r"known to 0\.2 % by the photos' GPS",
+    "may I trust the scale?": r"known to 0\.2 %, 22\.4 mm in 10 m",
     "where is the file?": r"objects/house/fused\.ply",
     "what next?": "photograph it from 4 places",
-    "who made it?": r"Made by scenefuse \d",
+    "who made it?": r"Made by Hof Müller, scenefuse \d.* on 20\d\d-",
+    "which frame?": r"with its surroundings \(local frame, metres\)",
+    "what is that beside the GPS?": r"relative: on Earth it is known as well as the scene",
 }
 SHOWN = """
 const found = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
@@ -362,14 +365,17 @@ def test_a_clients_questions_are_answered_by_the_first_screens(tmp_path, phone, 
     page = report(tmp_path, {"house": None})
     rows = {
         "scenes": "scene=yard length_unit=m points=900 completed_points=1000 completed_by=house crs=EPSG:25832"
-        " photographed=2024-06-01 photos=60 registered=60 gps_scale_sd_log=0.002",
+        " photographed=2024-06-01 photos=60 registered=60 gps_scale_sd_log=0.002 made_by=Hof_Müller",
         "objects": "object=house scene=yard status=registered unit=m length=11.4 width=10.1 height=7.85"
         " surface_missing=0.02 surface_never_seen=0.009 deviation=0.00692 world_deviation=0.0129"
-        " scale_sd_log=0.001 registered=40 frames=40 added_points=75 stations=4 stations_show=0.7",
+        " scale_sd_log=0.001 scene_scale_sd_log=0.002 crs=EPSG:25832 photographed=2024-06-02"
+        " surface_untextured=0.011 registered=40 frames=40 added_points=75 stations=4 stations_show=0.7",
     }
     for name, row in rows.items():
         columns, cells = zip(*(pair.split("=") for pair in row.split()))
-        (tmp_path / f"summary/{name}.tsv").write_text("\t".join(columns) + "\n" + "\t".join(cells) + "\n")
+        (tmp_path / f"summary/{name}.tsv").write_text(
+            "\t".join(columns) + "\n" + "\t".join(cells).replace("f_M", "f M") + "\n"
+        )
     (tmp_path / "yard").mkdir()
     known = {"scenes": [tmp_path / "yard"], "objects": [tmp_path / "house"], "title": "test", "report": page}
     write_report(summary=tmp_path / "summary", **known)

@@ -184,7 +184,7 @@ def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results)
     assert "Result        Not finished: no <mask> matches a frame [masks/sculpture.log]" in text
     assert "dense.fallback: CPU used" in text
     words = " ".join(text.split())
-    assert "30 added, 16 of the scene removed" in words and "of the object unconfirmed 7" in words
+    assert "added 30 points, removed from the scene 16 points, of the object unconfirmed 7" in words
     assert "photos see a surface behind it 4" in words and "the object measured it better 12 points" in words
     assert "fusion.notes: judged by the scene's photos" in words and "evidence.notes" not in words
     assert "1 of 3 objects registered" in text
@@ -466,6 +466,7 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
     page = report(results)
     text = (results / "summary/summary.txt").read_text()
     assert len(text.splitlines()) < 45 and max(map(len, text.splitlines())) <= 100
+    assert "% measured" not in text + page.split('id="record"')[0]
     card = page.split('id="house"')[1].split("<section")[0]
     assert '<a href="../objects/house/next_photos.csv">results/objects/house/next_photos.csv</a>' in card
     card = re.sub("<.+?>", "", card)
@@ -473,7 +474,7 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
         "11.4 m × 9.96 m, 8.10 m high",
         "98.2 % is there, 1.8 % is missing: 1.0 % seen by no photo, 0.8 % where photos disagree;"
         " of the ground at its foot 1.2 % is missing",
-        "13.1 mm in the scene, the standard deviation of a point (two of three points are nearer)",
+        "13.1 mm in the scene, the standard deviation of a point (two of three are nearer)",
         "Photograph it from 3 places (results/objects/house/next_photos.csv): this would show 77 % of what no photo",
     ):
         assert sentence in " ".join(text.split()) and sentence in card, sentence

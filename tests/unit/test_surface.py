@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -493,21 +494,24 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
     assert capsys.readouterr().out == exported
 
 
-def test_the_report_says_of_a_surface_how_much_is_measured(closed, tmp_path: Path):
+def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_interpolated(closed, tmp_path: Path):
     assert surface_facts(tmp_path) == {}
     (tmp_path / "fused.ply").touch()
     write_json(tmp_path / "surface.json", surface_report(closed, "m") | {"reason": quantity("", "")})
     found = surface_facts(tmp_path)["Mesh"]
-    assert "% measured" in found and "% left open" in found and found.endswith(f"objects/{tmp_path.name}/surface.glb")
+    assert f"objects/{tmp_path.name}/surface.ply (local frame, metres)" in found and "%" not in found
+    assert "surface.glb (the same, metres, y up)" in found
+    bridged = surface_report(closed, "m")["bridged_area"]["value"]
+    assert f"{bridged:.2g} m² of it are interpolated" in found if bridged else "interpolated" not in found
     pdf, made = tmp_path / "drawings/drawings.pdf", (tmp_path / "surface.json").stat().st_mtime
     pdf.parent.mkdir()
     pdf.touch()
     for age, listed in ((10, False), (-10, True)):
         os.utime(pdf, (made - age, made - age))
-        assert ("drawings.pdf" in surface_facts(tmp_path)["Mesh"]) == listed
+        assert ("Drawings" in surface_facts(tmp_path)) == listed
 
 
-def test_an_object_has_two_pages_on_paper_with_its_sides_to_one_scale_and_its_scene_one(coarse, tmp_path: Path):
+def test_paper_begins_with_an_overview_and_gives_an_object_two_pages_with_its_sides_to_scale(coarse, tmp_path: Path):
     shed, summary = tmp_path / "objects/shed", tmp_path / "summary"
     (shed / "figures").mkdir(parents=True)
     summary.mkdir()
@@ -529,9 +533,29 @@ def test_an_object_has_two_pages_on_paper_with_its_sides_to_one_scale_and_its_sc
     )
     pages = [page.get_textpage().get_text_bounded() for page in pypdfium2.PdfDocument(tmp_path / "r.pdf")]
     assert len(pages) == 3
-    assert "Hof Müller" in pages[0] and "11.4 m × 10.0 m, 8.10 m high" in pages[0]
-    assert "Scene yard" in pages[2] and "ETRS89 / UTM zone 32N (EPSG:25832)" in pages[2]
-    assert "from the north" in pages[1] and "1.00 scene units" in pages[1]
+    assert "Hof Müller" in pages[0] and "Scene yard" in pages[0] and "ETRS89 / UTM zone 32N (EPSG:25832)" in pages[0]
+    assert "completed" in pages[0] and "11.4 m × 10.0 m, 8.10 m high" in pages[0] and "11.4 m" in pages[1]
+    assert "from the north" in pages[2] and "1.00 scene units" in pages[2] and "1:" not in pages[2]
+
+
+def test_four_sides_on_paper_are_to_the_round_scale_that_is_written_below(coarse, tmp_path: Path):
+    write_surface(tmp_path / "surface.ply", coarse)
+    write_glb(tmp_path / "surface.glb", coarse, {})
+    write_json(tmp_path / "georeference.json", GEOREFERENCE)
+    files = {"surface": tmp_path / "surface.ply", "glb": tmp_path / "surface.glb"}
+    draw_surface(
+        name="shed", folder=tmp_path / "shed/drawings", georeference_json=tmp_path / "georeference.json", **files
+    )
+    (tmp_path / "objects.tsv").write_text("object\tstatus\nshed\tregistered\n")
+    write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")
+    page = pypdfium2.PdfDocument(tmp_path / "r.pdf")[2]
+    scale = int(re.search(r"1:(\d+) on A4", page.get_textpage().get_text_bounded())[1])
+    known = read_json(tmp_path / "shed/drawings/drawings.json")
+    with rasterio.open(tmp_path / "shed/drawings/south.tif") as file:
+        wide_m = file.width * value(known, "south_pixel")
+    left, _, right, _ = next(iter(page.get_objects([3]))).get_bounds()
+    assert (right - left) / 72 * 0.0254 * scale == pytest.approx(wide_m, rel=0.01)
+    assert scale in {round(k * 10.0**power) for k in (1, 1.5, 2, 2.5, 3, 4, 5, 7.5) for power in range(4)}
 
 
 def test_a_report_on_paper_of_what_failed_says_so(tmp_path: Path):

@@ -79,6 +79,7 @@ def run_options(wildcards=None):
     given = {
         "scene_of": [row.get("scene", "") for row in OBJECTS.values()],
         "given_scenes": [what_is_given(row) for row in SCENES.values()],
+        "made_by": [row.get("made_by", "") for row in SCENES.values()],
         "given_objects": [what_is_given(row) for row in OBJECTS.values()],
     }
     given = flags({name: found for name, found in given.items() if found})

@@ -14,7 +14,6 @@ TABLES = [
     "runtime",
     "scenes",
     "objects",
-    "disk",
 ]
 
 
