@@ -150,7 +150,6 @@ def _report(missing: Missing, plan: Plan) -> dict[str, Any]:
     shares = {kind.name.lower(): missing.share(kind) for kind in Lack}
     return {
         "status": quantity("found", ""),
-        "surface_cells": quantity(missing.covered_cells + len(missing.cells), "cells"),
         "missing": quantity(sum(shares.values()), "of the object's surface"),
         **{name: quantity(share, "of the object's surface") for name, share in shares.items()},
         "stations": quantity(len(plan.stations), ""),

@@ -234,9 +234,7 @@ def evidence_report(fused: Fused, checked: Checked | None) -> dict[str, Any]:
         return content | {"notes": quantity(["no photo was compared"], "")}
     of_object, of_scene = (c.fields["evidence"] == Evidence.MEASURED for c in (checked.obj, checked.scene))
     return content | {
-        "scene_checked": quantity(len(of_scene), "points"),
         "scene_measured": quantity(int(of_scene.sum()), "points"),
-        "object_points": quantity(len(of_object), "points"),
         "object_measured": quantity(int(of_object.sum()), "points"),
         "object_measured_share": quantity(float(of_object.mean()) if len(of_object) else None, "1"),
         "object_contradicted": quantity(int(checked.contradicted.sum()), "points"),

@@ -54,31 +54,6 @@ class Photos:
     pixels: NDArray[np.uint8]
     starts: NDArray[np.int64]
 
-    @property
-    def sizes(self) -> NDArray[np.int64]:
-        """(V, 2) width and height."""
-        return np.array([(v.width, v.height) for v in self.views], dtype=np.int64).reshape(-1, 2)
-
-    @property
-    def projections(self) -> Array:
-        """(V, 3, 4)."""
-        return np.array([v.projection for v in self.views]).reshape(-1, 3, 4)
-
-    @property
-    def centres(self) -> Array:
-        """(V, 3)."""
-        return np.array([v.centre for v in self.views]).reshape(-1, 3)
-
-    @property
-    def rights(self) -> Array:
-        """(V, 3) x axes of the cameras."""
-        return np.array([v.cam_from_world[0, :3] for v in self.views]).reshape(-1, 3)
-
-    @property
-    def focals(self) -> Array:
-        """(V,) in pixels."""
-        return np.array([np.sqrt(v.intrinsics[0, 0] * v.intrinsics[1, 1]) for v in self.views])
-
 
 def pack(views: list[View]) -> Photos:
     """Views with grey pixels (H, W) uint8, made ready for the kernel."""
@@ -214,9 +189,13 @@ def _match(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Match
     tested, confirming = np.zeros(count, np.int64), np.zeros(count, np.int64)
     texture, step = np.zeros(count), np.zeros(count)
     if count and len(photos.views) >= CONFIRMING_PHOTOS:
+        views = photos.views
+        sizes, projections = np.array([(v.width, v.height) for v in views]), np.array([v.projection for v in views])
+        centres, rights = np.array([v.centre for v in views]), np.array([v.cam_from_world[0, :3] for v in views])
+        focals = np.array([np.sqrt(v.intrinsics[0, 0] * v.intrinsics[1, 1]) for v in views])
         match_points(
             np.ascontiguousarray(points), np.ascontiguousarray(normals, dtype=np.float64), photos.pixels, photos.starts,
-            photos.sizes, photos.projections, photos.centres, photos.rights, photos.focals,
+            sizes, projections, centres, rights, focals,
             curve, noise, tested, confirming, texture, step, MIN_MATCH, MAX_DROP,
         )  # fmt: skip
     away = PEAK_FACTOR * _peak(curve) * step

@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pyproj
-from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing, write_cloud
 from scenefuse.cloud.crs import plane
@@ -17,11 +16,11 @@ from scenefuse.cloud.readers.las import LAS_DIMENSIONS, las_crs
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
-from scenefuse.geometry.visual_hull import MAX_WRONG_SHARE
+from scenefuse.geometry.visual_hull import MAX_WRONG_SHARE, Outline, count_silhouettes
 from scenefuse.georef.on_cloud import FIT, check_fit, cloud_crs, fit_to_cameras, in_local, misfit
 from scenefuse.photos.cameras.given import read_place
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
-from scenefuse.photos.workspace import View, read_model, read_views, with_mask
+from scenefuse.photos.workspace import read_model, read_views, with_mask
 
 # Masks are grown by this share of the photo's width.
 MASK_MARGIN = 0.005
@@ -177,16 +176,6 @@ def _turn_there(exact: Callable[[Array], Array], place: Array) -> Sim3:
     return Sim3(1.0, left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right, np.zeros(3))
 
 
-def inside_masks(points: Array, views: list[View]) -> NDArray[np.bool_]:
-    """(N,) which points lie inside the masks of nearly all photos that frame them; views: with masks as pixels."""
-    framed, inside = (np.zeros(len(points), np.int64) for _ in range(2))
-    for view in views:
-        rows, pixels, _ = view.visible(points)
-        framed[rows] += 1
-        inside[rows] += view.pixels[pixels[:, 1], pixels[:, 0]]
-    return np.asarray((framed >= CONFIRMING_PHOTOS) & (framed - inside <= MAX_WRONG_SHARE * framed))
-
-
 def _cut_out(whole: Cloud, source: Path, workspace: Path, masks: Path) -> Cloud:
     """What of an object's cloud lies inside its masks, grown by what these err at outlines."""
     views = []
@@ -196,7 +185,8 @@ def _cut_out(whole: Cloud, source: Path, workspace: Path, masks: Path) -> Cloud:
             side = 2 * int(np.ceil(MASK_MARGIN * view.width)) + 1
             grown = cv2.dilate(with_mask(view, path).pixels, np.ones((side, side), np.uint8))
             views.append(replace(view, pixels=grown > 127))
-    part = whole[inside_masks(whole.points, views)]
+    shown, missed, *_ = count_silhouettes(whole.points, map(Outline, views))
+    part = whole[(shown >= CONFIRMING_PHOTOS) & (missed <= MAX_WRONG_SHARE * shown)]
     if len(part) < MIN_POINTS:
         raise StageError(
             f"only {len(part)} of {len(whole)} points of {source} lie inside the masks in {masks}; look at masks.png"

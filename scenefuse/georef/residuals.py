@@ -103,7 +103,7 @@ def _length(error: Array) -> float:
 
 def georeference_report(found: Georeference, left: Residuals, cue: str) -> dict[str, Any]:
     """Content of georeference.json; what matters of it is printed."""
-    placement, gps, unit = found.placement, found.gps, "m" if found.metric else "scene units"
+    placement, unit = found.placement, "m" if found.metric else "scene units"
     measured_by = "control points" if found.control else "GPS" if len(placement.inliers) else "given cameras"
     print(f"{placement.status}: {placement.reason}; unit: {unit}", flush=True)
     transform = placement.local_from_model
@@ -114,10 +114,9 @@ def georeference_report(found: Georeference, left: Residuals, cue: str) -> dict[
         "metric": quantity(found.metric, ""),
         "scene_from_sparse": quantity(transform.matrix, unit),
         "scale": quantity(transform.scale, f"{unit} per unit of the sparse model"),
-        "photos_with_gps_height": quantity(int(np.isfinite(gps.positions[:, 2]).sum()), "1"),
         "up_cue": quantity(cue if placement.levelled else measured_by, ""),
     }
-    content |= {} if left.lengths is None else _of_lengths(left.lengths, found.placement.status)
+    content |= {} if left.lengths is None else _of_lengths(left.lengths)
     if found.placement.status != "georeferenced" or found.frame is None:
         return content
     frame, crs_from_local = found.frame, found.frame.crs_from_local()
@@ -136,12 +135,11 @@ def georeference_report(found: Georeference, left: Residuals, cue: str) -> dict[
     return content | (_of_cameras(found, left) if len(placement.inliers) else {})
 
 
-def _of_lengths(lengths: Lengths, status: str) -> dict[str, Any]:
+def _of_lengths(lengths: Lengths) -> dict[str, Any]:
     """Errors of known lengths, as quantities."""
     error = lengths.in_model - lengths.metres
     content = {
         "lengths": quantity(len(error), "1"),
-        "lengths_used": quantity(status == "scaled", ""),
         "length_rms_m": quantity(rms(error[:, None]), "m"),
         "length_rms_pct": quantity(100 * (rms(error[:, None] / lengths.metres[:, None]) or 0.0), "%"),
     }

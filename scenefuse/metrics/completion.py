@@ -111,11 +111,6 @@ def completion_metrics(parts: Sequence[Completion], settings: MetricSettings, se
     return found | {"added_points": added}
 
 
-def variation_radius(part: Completion, settings: MetricSettings) -> float:
-    """Radius of the surface variation, in the scene's unit (method G2)."""
-    return settings.variation_spacings * spacing(part.before)
-
-
 def _random_cloud(like: Array, seed: int) -> Array:
     return np.random.default_rng(seed).uniform(like.min(0), like.max(0), like.shape)
 
@@ -138,7 +133,8 @@ def _variation_and_primitives(
     The objects are weighted by the number of these points.
     """
     at, weights = [sampled(points, settings.sample, seed) for points in of], [len(points) for points in of]
-    smooth = [surface_variation(c, a, variation_radius(p, settings)) for c, a, p in zip(clouds, at, parts)]
+    radii = [settings.variation_spacings * spacing(part.before) for part in parts]
+    smooth = [surface_variation(*given) for given in zip(clouds, at, radii)]
     plain = [_primitives(c, a, p.diagonal, settings, seed) for c, a, p in zip(clouds, at, parts)]
     return {"surface_variation": _mean(smooth, weights), "primitive_fitting_score": _mean(plain, weights)}
 

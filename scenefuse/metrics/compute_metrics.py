@@ -11,7 +11,7 @@ from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.fuse.write import Source
-from scenefuse.metrics.completion import MetricSettings, completion_metrics, completion_of, variation_radius
+from scenefuse.metrics.completion import MetricSettings, completion_metrics, completion_of
 from scenefuse.register.score import registration_metrics
 
 
@@ -57,8 +57,7 @@ def compute_metrics(
             if np.isfinite(known).any():
                 content["object"][name] = quantity(float(np.nanmedian(known)), unit)
         part = completion_of(scene.points, after, Source.OBJECT, diagonal)
-        radius = {"surface_variation_radius": quantity(variation_radius(part, settings), unit)}
-        content["completion"] = completion_metrics([part], settings, seed) | radius
+        content["completion"] = completion_metrics([part], settings, seed)
     _write(report, content)
 
 

@@ -66,7 +66,7 @@ def fuse_depth_maps(
         cloud: output PLY in the workspace's frame: float64 positions, normals, colours, `views` (photos
             that agree on the point).
         report: output JSON: number of points, spacing, the share of the pixels with a depth that are in
-            the cloud, a note where it is small, and the share that other maps voted out.
+            the cloud, and a note where it is small.
 
     Raises:
         StageError: no depth maps, or no point on which enough photos agree.
@@ -80,7 +80,7 @@ def fuse_depth_maps(
         raise StageError(f"no depth maps in {', '.join(map(str, depth))}; run the depth stage first")
     print(f"fusing {len(maps)} depth maps", flush=True)
     sources = {name: photo["sources"] for path in depth_json for name, photo in read_json(path)["photos"].items()}
-    fused, pixel, measured, left = _fuse(workspace, maps, neighbours(sources), settings)
+    fused, pixel, measured = _fuse(workspace, maps, neighbours(sources), settings)
     if len(fused) == 0:
         raise StageError(
             f"no point is seen alike by {settings.min_photos} photos; lower scene.dense_cloud.min_photos, or check the"
@@ -91,8 +91,7 @@ def fuse_depth_maps(
     print(f"{len(kept)} points, {(~near).sum()} of {len(fused)} dropped as outliers before thinning", flush=True)
     content = _report(kept, measured, length_unit(georeference_json))
     write_tiled(cloud, lambda: [kept], len(kept), kept.points)
-    content |= {"depth_maps": quantity(len(maps), "1"), "outvoted_share": quantity(1 - left / max(measured, 1), "1")}
-    write_json(report, content)
+    write_json(report, content | {"depth_maps": quantity(len(maps), "1")})
 
 
 def _report(cloud: Cloud, measured: int, unit: str) -> dict[str, Any]:
@@ -115,9 +114,9 @@ def _report(cloud: Cloud, measured: int, unit: str) -> dict[str, Any]:
 
 def _fuse(
     workspace: Path, maps: Mapping[str, Path], near: Mapping[str, list[str]], settings: DenseCloudSettings
-) -> tuple[Cloud, float, int, int]:
+) -> tuple[Cloud, float, int]:
     """A cloud with `views` of the pixels that enough maps confirm, the size of the finest map's pixels on the surface,
-    and how many pixels have a depth before and after the vote.
+    and how many pixels have a depth.
 
     Where several maps show a place, the finest one gives its points.
 
@@ -133,16 +132,15 @@ def _fuse(
     measured = lru_cache(MAX_PHOTOS)(lambda name: _read_map(cameras[name], workspace / "images", maps[name]))
     confirmed: dict[str, NDArray[np.uint8]] = {}  # eight pixels in one number
     pixel: dict[str, float] = {}
-    before, after = 0, 0
+    count = 0
     for name in sorted(maps):
         own = measured(name)
         votes = vote(own, map(measured, near[name]), *limits)
         stays = votes.agree > votes.through
         if settings.min_photos < 2:
             stays |= votes.through == 0
-        stays &= own.view.pixels > 0
-        before, after = before + int((own.view.pixels > 0).sum()), after + int(stays.sum())
-        stays &= votes.agree + 1 >= settings.min_photos
+        stays &= (own.view.pixels > 0) & (votes.agree + 1 >= settings.min_photos)
+        count += int((own.view.pixels > 0).sum())
         confirmed[name] = np.packbits(stays)
         pixel[name] = float(np.median(own.view.pixels[stays])) / own.view.intrinsics[0, 0] if stays.any() else math.inf
 
@@ -156,7 +154,7 @@ def _fuse(
         finer = vote(own, (surface(other) for other in near[name] if place[other] < place[name]), *limits)
         own = _only(own, finer.agree == 0)
         parts.append(_points(own, vote(own, map(measured, near[name]), *limits)))
-    return concatenate(parts), min(pixel.values()), before, after
+    return concatenate(parts), min(pixel.values()), count
 
 
 def _read_map(camera: View, photos: Path, folder: Path) -> DepthMap:

@@ -5,7 +5,6 @@ Columns are what the paper published, its preset here, the shipped recipe, and c
 
 import csv
 import importlib.resources
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -135,9 +134,6 @@ def why_not_comparable(pairs: list[tuple[Path, Path]], item: ObjectSummary, othe
                 return f"{its} is of other photos than {own}"
     except StageError as error:
         return str(error)
-    here, there = _tau_share(item), _tau_share(other)
-    if here is not None and there is not None and not math.isclose(here, there, rel_tol=1e-6):
-        return f"{pairs[0][1]} is measured at another tau ({there:.4g} of the crop's diagonal, here {here:.4g})"
     return ""
 
 
@@ -146,13 +142,6 @@ def _taken_from(folder: Path) -> Any:
     if (folder / "photos.json").is_file():
         return sorted(photo["sha256"] for photo in read_json(folder / "photos.json").get("photos", []))
     return [find(load(folder / name), "points") for name in ("object.json", "dense.json")]
-
-
-def _tau_share(item: ObjectSummary) -> float | None:
-    """Tau as a share of the crop's diagonal; None without a pose."""
-    fields = item.variants.get("full", {})
-    tau, diagonal = find(fields, "metrics.registration.tau"), find(fields, "crop.diagonal")
-    return None if tau is None else tau / diagonal
 
 
 def paper_section(rows: list[dict[str, str]]) -> str:

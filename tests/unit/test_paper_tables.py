@@ -38,13 +38,13 @@ def photos_of(name, digest=""):
     return {"photos": [{"name": "0.jpg", "sha256": digest or f"of {name}"}]}
 
 
-def registration_of(fitness, unit, diagonal=10.0, tau_share=0.016):
+def registration_of(fitness, unit, diagonal=10.0):
     found = {"fitness": (fitness, "1"), "inlier_rmse": (fitness / 4, unit), "normal_consistency": (fitness / 2, "1")}
-    found |= {"inlier_rmse_over_diagonal": (fitness / 4 / diagonal, "1"), "tau": (tau_share * diagonal, unit)}
+    found |= {"inlier_rmse_over_diagonal": (fitness / 4 / diagonal, "1"), "tau": (0.016 * diagonal, unit)}
     return {name: quantity(number, u) for name, (number, u) in found.items()}
 
 
-def write_object(folder, recipe, fitness, unit="m", tau_share=0.016):
+def write_object(folder, recipe, fitness, unit="m"):
     """An object that went through: fitness as given in `full`, a half of it in `no_scale`, a quarter in `no_crop`."""
     write_json(folder / "photos.json", photos_of(folder.name))
     (folder / "features.db").touch()
@@ -65,7 +65,7 @@ def write_object(folder, recipe, fitness, unit="m", tau_share=0.016):
             write_json(registered / f"{stage}.json", {})
         pose = quantity(np.diag([8.0, 8, 8, 1]), "")
         write_json(registered / "fine.json", {"status": status, "reason": quantity("", ""), "scene_from_object": pose})
-        measured = {"registration": registration_of(fitness / share, unit, tau_share=tau_share)}
+        measured = {"registration": registration_of(fitness / share, unit)}
         if variant == "full":
             write_cloud(registered / "crop.ply", Cloud(rng.uniform(0, 1, (500, 3)) * [8, 6, 0]))
             completion = {name: quantity(number * fitness, "1") for name, number in COMPLETION.items()}
@@ -236,12 +236,11 @@ def test_a_run_that_does_not_belong_there_gives_no_number_and_is_named(folder, s
     [
         (lambda house: (house / "photos.json").write_text("{"), "is not valid JSON"),
         (lambda house: write_json(house / "photos.json", photos_of("house", "other")), "is of other photos than"),
-        (lambda house: write_object(house, "scenefuse", 0.9, tau_share=0.02), "at another tau (0.02 of the crop's"),
         (lambda house: house.rename(house.with_name("barn")), "house is of other photos than"),
         (lambda house: (house / "masks.json").unlink(), "scenefuse: missing, no error in its logs"),
         (lambda house: fail(house.parents[1], "house", "no surface"), "scenefuse: failed, no surface"),
     ],
-    ids=["damaged", "photos", "tau", "not in it", "being made again", "failed"],
+    ids=["damaged", "photos", "not in it", "being made again", "failed"],
 )
 def test_an_object_that_cannot_be_compared_gives_no_number_and_leaves_the_others(folder, spoil, words):
     spoil(folder / SHIPPED / "objects/house")

@@ -84,7 +84,7 @@ _known: dict[Any, Matches] = {}
 
 def _matched(points: Any, normals: Any, photos: Photos) -> Matches:
     """`match_in`, kept between rules that do not change it."""
-    key = points.tobytes(), photos.projections.tobytes()
+    key = points.tobytes(), np.array([view.projection for view in photos.views]).tobytes()
     if key not in _known:
         _known[key] = photo_check.match_in(points, normals, photos)
     return Matches(*(values.copy() for values in vars(_known[key]).values()))
