@@ -45,7 +45,7 @@ def complete(
     out: Annotated[Path | None, _shown("FOLDER")] = None,
     prompts: Annotated[tuple[Path, ...], _shown("FILE ...")] = (),
     masks: Annotated[tuple[Path, ...], _shown("FOLDER ...")] = (),
-    preset: Preset = "normal",
+    preset: Annotated[Preset | None, _shown()] = None,
     cores: Annotated[int | None, _shown("N")] = None,
     no_browser: Annotated[tyro.conf.UseCounterAction[int], _shown()] = 0,
 ) -> None:
@@ -59,7 +59,8 @@ def complete(
         out: folder of the project; where it is left out, FLIGHT_completed.
         prompts: tables of clicks, one for each object in its order, in place of the page.
         masks: folders of masks, one for each object in its order, named like its photos; white is the object.
-        preset: of a new project: settings for a first look, the shipped ones, or larger ones for a GPU.
+        preset: of a new project: settings for a first look, the shipped ones (normal, where it is left out), or larger
+            ones for a GPU.
         cores: processor cores; where it is left out, all.
         no_browser: open neither the page nor the report.
 
@@ -82,14 +83,14 @@ def complete(
         webbrowser.open((project / SUMMARY / "report.html").resolve().as_uri())
 
 
-def _make_or_go_on(project: Path, flight: Path, objects: Sequence[Path], preset: Preset) -> None:
+def _make_or_go_on(project: Path, flight: Path, objects: Sequence[Path], preset: Preset | None) -> None:
     """Make the project, where it is not there yet; objects beside all that it has are added.
 
     Raises:
         StageError: the folder holds another project.
     """
     if not (project / SCENES).is_file():
-        make_project(project, flight, objects, preset)
+        make_project(project, flight, objects, preset or "normal")
         return
     for table, rows in project_rows(project, flight, objects).items():
         kind = table.stem.removesuffix("s")
@@ -106,6 +107,10 @@ def _make_or_go_on(project: Path, flight: Path, objects: Sequence[Path], preset:
             for column, cell in added.items():
                 fill(project / table, column, {added[kind]: cell})
     print(f"Going on with {project}", flush=True)
+    if preset:
+        print(
+            f"--preset {preset} is left out: the settings of this project are in {project / OWN_SETTINGS}", flush=True
+        )
 
 
 def _check_options(files: Mapping[str, Sequence[Path]], objects: int, cores: int | None) -> None:

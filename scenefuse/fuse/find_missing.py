@@ -25,8 +25,6 @@ from scenefuse.photos.geodesy import GridFrame, LocalFrame, scene_frame
 from scenefuse.photos.workspace import View, with_mask
 
 POSITION = ("longitude_deg", "latitude_deg", "altitude_m")
-COLUMNS = ("station", "photo", "x", "y", "z", *POSITION, "above_close_ups", "heading_deg", "pitch_deg", "shows")
-"""Columns of the table of photos; heading clockwise from north (from y without georeferencing), pitch above level."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,8 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     write_cloud(outputs.missing, missing.cells)
     georeference = read_json(inputs.georeference_json)
     gps_higher = float(value(georeference, "gps_shift")[2]) if "gps_shift" in georeference else 0.0
-    rows = photo_rows(plan, cameras, scene_frame(georeference), gps_higher)
+    unit = value(georeference, "length_unit")
+    rows = photo_rows(plan, cameras, scene_frame(georeference), gps_higher, unit)
     _write_table(outputs.next_photos, rows)
     _write_geojson(outputs.geojson, rows)
     content = _report(missing, plan) | {
@@ -160,32 +159,38 @@ def _report(missing: Missing, plan: Plan) -> dict[str, Any]:
 
 
 def photo_rows(
-    plan: Plan, close_ups: list[View], frame: LocalFrame | GridFrame | None, gps_higher: float = 0.0
+    plan: Plan, close_ups: list[View], frame: LocalFrame | GridFrame | None, gps_higher: float = 0.0, unit: str = "m"
 ) -> list[dict[str, Any]]:
-    """A row for each photo; `gps_higher`: metres by which the flight's GPS counts heights higher than the scene."""
+    """A row for each photo; heading clockwise from north (from y without georeferencing), pitch above level.
+
+    Args:
+        plan: the stations.
+        close_ups: the object's photos.
+        frame: where the scene lies; None where nothing says it.
+        gps_higher: metres by which the flight's GPS counts heights higher than the scene.
+        unit: of the scene's lengths.
+    """
     rows, highest = [], max((float(view.centre[2]) for view in close_ups), default=0.0)
+    unit = unit.replace(" ", "_")
     for number, station in enumerate(plan.stations, 1):
         for view in station.photos:
             ahead = view.cam_from_world[2, :3]
-            row = {
-                "station": number,
-                "photo": int(view.name),
-                **{axis: float(f"{at:.7g}") for axis, at in zip("xyz", view.centre)},
-            }
+            row: dict[str, Any] = {"station": number, "photo": int(view.name)}
             if frame is not None and has_place(frame.crs):
                 latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
                 row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
                 row["altitude_m"] = round(altitude + gps_higher, 3)
-            row["above_close_ups"] = float(f"{view.centre[2] - highest:.4g}")
+            row[f"above_highest_close_up_{unit}"] = float(f"{view.centre[2] - highest:.4g}")
             row["heading_deg"] = round(float(np.degrees(np.arctan2(ahead[0], ahead[1]))) % 360, 1)
             row["pitch_deg"] = round(float(np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))), 1)
-            rows.append(row | {"shows": round(station.shows, 4)})
+            row["shows_percent_of_missing"] = round(100 * station.shows, 1)
+            rows.append(row | {f"local_{axis}_{unit}": float(f"{at:.7g}") for axis, at in zip("xyz", view.centre)})
     return rows
 
 
 def _write_table(path: Path, rows: list[dict[str, Any]]) -> None:
     """CSV of the photos; a heading alone where there are none."""
-    columns = [name for name in COLUMNS if not rows or name in rows[0]]
+    columns = list(rows[0]) if rows else ["station", "photo"]
     with atomic_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
@@ -198,7 +203,7 @@ def _write_geojson(path: Path, rows: list[dict[str, Any]]) -> None:
         {
             "type": "Feature",
             "geometry": {"type": "Point", "coordinates": [row[k] for k in POSITION]},
-            "properties": {k: v for k, v in row.items() if k not in (*POSITION, *"xyz")},
+            "properties": {k: v for k, v in row.items() if k not in POSITION and not k.startswith("local_")},
         }
         for row in rows
         if POSITION[0] in row

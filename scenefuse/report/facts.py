@@ -12,7 +12,6 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-import yaml
 from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, read_json, value
@@ -20,14 +19,12 @@ from scenefuse.core.version import VERSION
 from scenefuse.photos.photo_files import open_picture
 from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.report.run_summary import ALONE, ObjectSummary
-from scenefuse.report.values import asset, find, length, percent, percents, read_table, records
+from scenefuse.report.values import WORDS, find, length, percent, percents, read_table, records
 
 Row = Mapping[str, Any]
 # Photos of a scene whose ground pixels and dates are looked at, spread evenly.
 LOOKED_AT = 20
 DONE = ("registered", "ungated", ALONE)
-# Words for statuses, for what they rest on, and for what went wrong.
-WORDS: dict[str, dict[str, str]] = yaml.safe_load(asset("report.yaml"))["words"]
 # A wider angle without any photo leaves a side of the object unseen.
 MAX_GAP_DEG = 100.0
 # Masks are mentioned where more than this share of the photos is left out, or where the others agree by less (IoU).

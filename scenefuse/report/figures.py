@@ -22,12 +22,14 @@ from scenefuse.photos.pictures import read_depth, read_mask, read_rgb
 from scenefuse.photos.sheets import TILE_PX, Cell, Image, depth_colors, draw_sheet, save_png
 from scenefuse.photos.workspace import read_views
 from scenefuse.report.render import luminance, orbit_camera, point_radii, render
-from scenefuse.report.values import load, unit_of
+from scenefuse.report.values import WORDS, load, unit_of
 from scenefuse.report.view import REACH, view_of, within, write_view
 from scenefuse.sfm.gravity import estimate_up
 
 SCENE = "#cdd0d4"
-LACKS = {Lack.NEVER_SEEN: "#d6261f", Lack.UNTEXTURED: "#3465c4", Lack.CONTRADICTED: "#963caa"}
+LACKS = {
+    Lack.NEVER_SEEN: ("red", "#d6261f"), Lack.UNTEXTURED: ("blue", "#3465c4"), Lack.CONTRADICTED: ("purple", "#963caa")
+}  # fmt: skip
 # Azimuths of the four sides that a row of pictures shows.
 SIDES_DEG = (30.0, 120.0, 210.0, 300.0)
 # Clouds and the radii of their points' discs.
@@ -183,7 +185,7 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     colors = join.after.colors
     brightness = np.ones(len(join.after)) if colors is None else luminance(colors) / 255
     shade = _rgb(SCENE) * (0.6 + 0.4 * brightness[:, None])
-    colors = np.concatenate([shade, np.array([_rgb(LACKS[kind]) for kind in kinds.tolist()]).reshape(-1, 3)])
+    colors = np.concatenate([shade, np.array([_rgb(LACKS[kind][1]) for kind in kinds.tolist()]).reshape(-1, 3)])
     side = 1.2 * float(np.median(radii)) if len(cells) < 2 else 0.8 * spacing(cells.points)
     cloud, sizes = Cloud(np.concatenate([join.after.points, cells.points])), np.append(radii, np.full(len(cells), side))
     from_above = orbit_camera(np.concatenate([join.framed, join.stations]), -90.0, 90.0, TILE_PX, orthographic=True)
@@ -196,14 +198,14 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     for azimuth in SIDES_DEG[len(cameras) :]:
         cameras[f"azimuth {azimuth:.0f}°"] = orbit_camera(join.framed, azimuth, 20.0, TILE_PX)
     pictures = [(label, render(cloud, camera, sizes, colors)) for label, camera in cameras.items()]
-    counts = ", ".join(f"{kind.name.lower().replace('_', ' ')} {(kinds == kind).sum()}" for kind in Lack)
+    seen = ", ".join(f"{color}: {WORDS['missing'][kind.name.lower()]}" for kind, (color, _) in LACKS.items())
     shown = f", the best {len(toward)} shown" if len(toward) < len(join.stations) else ""
-    note = f"missing cells: {counts} (red, blue, purple)\nstations: {len(join.stations)}{shown}; see next_photos.csv"
+    note = f"{seen}\n{len(join.stations)} stations to photograph it from{shown}; where they are: next_photos.csv"
     sheet = draw_sheet(f"{name}: what is still missing", note, [pictures[:2], pictures[2:]])
     axes, middle = sheet.axes[0], from_above.project(join.framed.mean(0, keepdims=True))[0][0]
     for number, place in enumerate(from_above.project(join.stations)[0], 1):
         arrow = {"arrowstyle": "->", "color": "0.5", "shrinkB": 40}
-        mark = {"boxstyle": "circle", "color": LACKS[Lack.NEVER_SEEN]}
+        mark = {"boxstyle": "circle", "color": LACKS[Lack.NEVER_SEEN][1]}
         axes.annotate(
             str(number), middle, place, arrowprops=arrow, bbox=mark, color="white", ha="center", va="center"
         )  # fmt: skip
@@ -341,5 +343,5 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
         missing = read_cloud(inputs.missing) if share else Cloud(np.zeros((0, 3)))
     photos = pd.read_csv(inputs.next_photos)
     # The middle one of the three photos of a station.
-    stations = photos[photos.photo == 2][["x", "y", "z"]].to_numpy(np.float64)
+    stations = photos[photos.photo == 2].filter(like="local_").to_numpy(np.float64).reshape(-1, 3)
     return Surroundings(before, after, placed, inner(shown), fused, decision, unit, missing, stations)

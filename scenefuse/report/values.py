@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import yaml
 
 Fields = dict[str, dict[str, Any]]
 TEMPORARY = ".tmp-"
@@ -19,6 +20,10 @@ ASSETS = importlib.resources.files("scenefuse.report") / "assets"
 def asset(name: str) -> str:
     """The text of a file in assets/."""
     return (ASSETS / name).read_text(encoding="utf-8")
+
+
+# Words for statuses, for what they rest on, and for what went wrong.
+WORDS: dict[str, dict[str, str]] = yaml.safe_load(asset("report.yaml"))["words"]
 
 
 def flatten(content: Mapping[str, Any], prefix: str = "") -> Fields:

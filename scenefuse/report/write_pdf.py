@@ -12,8 +12,8 @@ from PIL import Image
 
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.version import VERSION
-from scenefuse.report.facts import WORDS, made_by, object_facts, scene_facts, surface_facts
-from scenefuse.report.values import length, read_table, records
+from scenefuse.report.facts import made_by, object_facts, scene_facts, surface_facts
+from scenefuse.report.values import WORDS, length, read_table, records
 from scenefuse.surface.gltf import metres_per_unit
 
 GAP_MM = 4

@@ -11,10 +11,10 @@ import pandas as pd
 import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.report.facts import WORDS, made_by, object_facts, scene_facts, surface_facts
+from scenefuse.report.facts import made_by, object_facts, scene_facts, surface_facts
 from scenefuse.report.page import document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
-from scenefuse.report.values import asset, number, read_table, records
+from scenefuse.report.values import WORDS, asset, number, read_table, records
 from scenefuse.report.view import View, read_view, thin
 from scenefuse.report.view_mesh import read_mesh
 

@@ -128,6 +128,12 @@ def test_a_failed_object_keeps_nobody_back_and_is_taken_in_once_it_is_mended(pro
     assert "2 of 2 objects registered" in (summary / "summary.txt").read_text()
     assert "Nothing to be done" in project("-n").stdout
 
+    # An export that fails is named until another run, which makes no summary, ends well.
+    assert project("results/objects/shed/surface.glb").returncode != 0
+    assert "jobs that failed" in (text := (summary / "summary.txt").read_text()) and "make_surface/shed" in text
+    assert project("--forcerun", "view_scene", "--", "results/scenes/yard/view.json").returncode == 0
+    assert "jobs that failed" not in (text := (summary / "summary.txt").read_text()) and "2 of 2 objects" in text
+
     # It fails again: what it left from before is out of date, and not in the completed scene.
     (tmp_path / "barn/2.jpg").write_bytes(b"broken once more")
     assert project().returncode != 0

@@ -74,7 +74,10 @@ def test_the_same_command_goes_on_and_other_folders_are_another_project(two_fold
     run("close", prompts=(Path("clicks.tsv"),))
     workflow("")
     run("close")
-    assert "Going on with flight_completed" in capsys.readouterr().out
+    assert "Going on with flight_completed" in (said := capsys.readouterr().out) and "preset" not in said
+    run("close", preset="draft")
+    said = capsys.readouterr().out
+    assert "--preset draft is left out: the settings of this project are in flight_completed/config/config.yaml" in said
     Project(two_folders).photos("shed")
     with pytest.raises(StageError, match=r"flight_completed holds another project \(objects: close\); delete it, or"):
         run("shed")

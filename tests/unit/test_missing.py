@@ -13,7 +13,7 @@ from support.painted_sphere import CENTER, RADIUS, sphere_views
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
-from scenefuse.fuse.find_missing import COLUMNS, MissingInputs, MissingOutputs, find_missing, photo_rows
+from scenefuse.fuse.find_missing import POSITION, MissingInputs, MissingOutputs, find_missing, photo_rows
 from scenefuse.fuse.missing import Lack, Plan, find_missing_surface, plan_stations
 from scenefuse.geometry.photo_check import pack
 from scenefuse.photos.geodesy import LocalFrame
@@ -141,17 +141,21 @@ def test_rows_say_where_to_stand_and_where_to_look(half):
     plan = plan_stations(missing, cloud, cloud, photos.views)
     frame = LocalFrame(47.4, 8.5, 400.0)
     rows = photo_rows(plan, photos.views, frame)
-    assert len(rows) == 3 * len(plan.stations) and set(rows[0]) == set(COLUMNS)
+    assert len(rows) == 3 * len(plan.stations)
     for row in rows:
-        eye = np.array([row[axis] for axis in "xyz"])
+        eye = np.array([row[f"local_{axis}_m"] for axis in "xyz"])
         back = frame.apply(np.array([[row[k] for k in ("latitude_deg", "longitude_deg", "altitude_m")]]))[0]
         np.testing.assert_allclose(back, eye, atol=0.01)
         ahead, heading, pitch = CENTER - eye, np.radians(row["heading_deg"]), np.radians(row["pitch_deg"])
         looks = [np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)]
         assert looks @ ahead > 0.99 * np.linalg.norm(ahead)
         highest = max(view.centre[2] for view in photos.views)
-        assert row["above_close_ups"] == pytest.approx(eye[2] - highest, abs=1e-3)
-    assert "longitude_deg" not in photo_rows(plan, photos.views, None)[0]
+        assert row["above_highest_close_up_m"] == pytest.approx(eye[2] - highest, abs=1e-3)
+    bare = photo_rows(plan, photos.views, None, unit="scene units")[0]
+    assert "longitude_deg" not in bare and bare["local_z_scene_units"] == rows[0]["local_z_m"]
+    assert sum(row["shows_percent_of_missing"] for row in rows[1::3]) == pytest.approx(
+        100 * sum(station.shows for station in plan.stations), abs=0.2
+    )
     # GPS may count heights from another zero than the scene does.
     higher = photo_rows(plan, photos.views, frame, gps_higher=47.0)
     assert {round(b["altitude_m"] - a["altitude_m"], 2) for a, b in zip(rows, higher)} == {47.0}
@@ -202,7 +206,7 @@ def test_the_stage_writes_cells_photos_and_shares(files):
         rows = list(csv.DictReader(file))
     features = json.loads(outputs.geojson.read_text())["features"]
     assert len(rows) == len(features) == 3 * value(report, "stations") > 0
-    assert features[0]["geometry"]["coordinates"] == [float(rows[0][k]) for k in COLUMNS[5:8]]
+    assert features[0]["geometry"]["coordinates"] == [float(rows[0][k]) for k in POSITION]
     assert value(report, "of") == "its surface"
     find_missing(inputs=replace(inputs, masks=None), outputs=outputs)
     report = read_json(outputs.report)
@@ -218,7 +222,7 @@ def test_of_an_unregistered_object_the_stage_writes_the_reason(files):
     find_missing(inputs=inputs, outputs=outputs)
     assert value(read_json(outputs.report), "reason") == "too few points"
     assert json.loads(outputs.geojson.read_text())["features"] == []
-    assert outputs.next_photos.read_text().strip() == ",".join(COLUMNS) and outputs.missing.is_file()
+    assert outputs.next_photos.read_text().strip() == "station,photo" and outputs.missing.is_file()
 
 
 def test_a_mask_of_another_size_is_one_sentence(files):

@@ -15,7 +15,7 @@ from scenefuse.core.job_records import KILLED, NO_LOG, NOT_ACCEPTED, JobRecords,
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.report.facts import closing_lines
 from scenefuse.report.run_summary import RunInputs
-from scenefuse.report.values import find, flatten, length, load, number, percent
+from scenefuse.report.values import find, flatten, length, load, number, percent, percents
 from scenefuse.report.write_report import write_report
 from scenefuse.report.write_summary import runtime_table, write_summary
 
@@ -523,6 +523,48 @@ def test_a_run_ends_in_three_lines(results):
     result, page, following = closing_lines(summarise(results, ["house"])).splitlines()
     assert result.startswith("Result: 1 of 1 objects completed; ") and result.endswith("scenes/demo/completed.ply")
     assert following == "Next:   house: Photograph it from 1 place (results/objects/house/next_photos.csv)"
+
+
+def test_shares_of_a_whole_sum_to_100_as_they_are_written():
+    for parts in ([0.9879, 0.0087, 0.0002, 0.0032], [1 / 3, 1 / 3, 1 / 3], [0.9996, 0.0002, 0.0002], [1.0, 0.0]):
+        first, rest, *each = percents(parts)
+        numbers = [float(text.removesuffix(" %")) for text in each if text]
+        assert float(first.removesuffix(" %")) + sum(numbers) == pytest.approx(100)
+        assert not numbers or float(rest.removesuffix(" %")) == pytest.approx(sum(numbers))
+    assert percents([0.9879, 0.0087, 0.0002, 0.0032]) == ["98.8 %", "1.2 %", "0.9 %", "", "0.3 %"]
+
+
+def test_an_object_says_when_it_was_photographed_and_how_its_lengths_follow_from_the_scene_s(results):
+    house, scene = results / "objects/house", results / "scenes/demo"
+    (house / "frames").mkdir()
+    for name, date in (("a", "2024:06:03"), ("b", "2024:06:02")):
+        exif = Image.Exif()
+        exif[0x0132] = f"{date} 09:30:00"
+        Image.new("RGB", (8, 6)).save(house / f"frames/{name}.jpg", exif=exif)
+    write_json(house / "photos.json", {"photos": [{"name": "a.jpg"}, {"name": "b.jpg"}]})
+    write_json(house / "sparse.json", {"registered": quantity(39, "1"), "total": quantity(40, "1")})
+    fine = json.loads((house / "registration/full/fine.json").read_text()) | {"scale_sd_log": quantity(0.003, "1")}
+    write_json(house / "registration/full/fine.json", fine)
+    here = {"length_unit": quantity("m", ""), "gps_scale_sd_log": quantity(0.004, "1")}
+    write_json(scene / "georeference.json", here)
+    text = (summarise(results, made_by=("Hof Müller",)) / "summary.txt").read_text()
+    assert re.search(r"Photos +39 of 40 used, taken 2024-06-02 to 2024-06-03\n", text)
+    assert re.search(r"Lengths +Known to 0\.5 %, 50\.0 mm in 10 m \(standard deviation\), plus", text)
+    assert re.search(r"Made by Hof Müller, scenefuse [\d.]+ on 20\d\d-\d\d-\d\d", text)
+    # Where control points hold the scene, its GPS does not say how well its lengths are known.
+    write_json(scene / "georeference.json", here | {"control_points": quantity(5, "1")})
+    text = (summarise(results) / "summary.txt").read_text()
+    assert re.search(r"Lengths +Known to 0\.3 %, 30\.0 mm in 10 m \(standard deviation\), beside the scene's\n", text)
+
+
+def test_a_long_advice_is_cut_in_summary_and_whole_in_details(results):
+    lost = [f"photo_{k:04d}_of_a_long_name.jpg" for k in range(30)]
+    write_json(results / "objects/house/sparse.json", {"not_registered": quantity(lost, "")})
+    summary = summarise(results)
+    short, long = ((summary / f"{name}.txt").read_text().split("object balloon")[0] for name in ("summary", "details"))
+    lines = short[short.index("Next  ") :].strip().splitlines()
+    assert len(lines) == 2 and lines[-1].endswith("... (details.txt)")
+    assert "photograph the steps between" in " ".join(long.split()) and "details.txt" not in long
 
 
 def test_shares_and_lengths_are_written_as_people_do():

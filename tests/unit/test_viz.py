@@ -185,7 +185,9 @@ def capture(tmp_path_factory):
     kinds = np.where(top[:, 0] < 0, 1, 2).astype(np.uint8)
     write_cloud(folder / "missing.ply", Cloud(top, None, None, {"missing": kinds}))
     write_json(folder / "missing.json", {"missing": quantity(0.1, "")})
-    (folder / "next_photos.csv").write_text("station,photo,x,y,z\n1,1,3,0,3\n1,2,3,1,3\n1,3,3,2,3\n")
+    (folder / "next_photos.csv").write_text(
+        "station,photo,local_x_m,local_y_m,local_z_m\n1,1,3,0,3\n1,2,3,1,3\n1,3,3,2,3\n"
+    )
     write_json(folder / "crop.json", {"diagonal": quantity(2.4, "m")})
     model = pycolmap.Reconstruction()
     pinhole = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[60, 60, 32, 24], camera_id=1)
@@ -281,7 +283,7 @@ def test_an_object_that_lacks_nothing_is_drawn(capture, tmp_path):
     kept = {name: (capture / name).read_bytes() for name in ("missing.ply", "missing.json", "next_photos.csv")}
     write_cloud(capture / "missing.ply", Cloud(np.zeros((0, 3)), None, None, {"missing": np.zeros(0, np.uint8)}))
     write_json(capture / "missing.json", {"missing": quantity(0.0, "")})
-    (capture / "next_photos.csv").write_text("station,photo,x,y,z\n")
+    (capture / "next_photos.csv").write_text("station,photo\n")
     draw(capture, REGISTERED, tmp_path / "figures")
     assert (tmp_path / "figures/missing.png").is_file()
     for name, content in kept.items():

@@ -274,6 +274,7 @@ onstart:
     refuse_read_only_folders()
     for line in forecast_run():
         print(line, file=sys.stderr)
+    forget_failures()
     mark_as_unfinished()
 
 
