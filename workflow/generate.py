@@ -19,7 +19,7 @@ START, END = "<!-- settings: written by `make docs`, do not edit -->", "<!-- end
 
 
 # The rendered demo's own sections; their descriptions are in the schema.
-LEFT_OUT = ("demo", "evaluation")
+LEFT_OUT = ("demo",)
 
 
 def leaves(part: dict[str, Any], prefix: str = "") -> dict[str, dict[str, Any]]:

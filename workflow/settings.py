@@ -26,7 +26,6 @@ from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.object_cloud import CloudSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
-from scenefuse.paper.compare_with_paper import ComparisonSettings
 from scenefuse.paper.monocular import MonocularSettings
 from scenefuse.photos.frames import FrameSettings
 from scenefuse.register.decision import FineSettings
@@ -137,7 +136,6 @@ SECTIONS: dict[str, list[Any]] = {
     "registration.crop": [CropSettings()],
     "registration.fine": [FineSettings()],
     "fusion": [FusionSettings()],
-    "evaluation.paper": [ComparisonSettings()],
 }
 # Keys of a dataclass that its section does not hold: the other section of the same stage sets them.
 ELSEWHERE = {("object.nerf", "epochs"), ("object.stage2", "rays_per_epoch"), ("object.stage4", "rays_per_epoch")}

@@ -1,12 +1,12 @@
 """The paper's Tables 2 to 4 of a run, as a table and a section of the report page.
 
-Columns are what the paper published, its preset here, the shipped recipe, and chance.
+Columns are what the paper published, its preset here, and chance.
 """
 
 import csv
 import importlib.resources
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,15 @@ import pandas as pd
 import yaml
 
 from scenefuse.cloud.clouds import Cloud, read_cloud
-from scenefuse.core.job_records import JobRecords
-from scenefuse.core.stage import StageError, atomic_file, read_json, setting
+from scenefuse.core.stage import atomic_file
 from scenefuse.core.transforms import Sim3
 from scenefuse.register.score import AgreementSettings, registration_metrics
 from scenefuse.report.run_summary import ObjectSummary, RunInputs, summarise
-from scenefuse.report.values import Fields, find, load, number
+from scenefuse.report.values import Fields, find, number
 
-PAPER, HERE, SCENEFUSE = "paper (published, its own data)", "paper preset (here)", "scenefuse"
+PAPER, HERE = "paper (published, its own data)", "paper preset (here)"
 NULL = "null"
-_HEADINGS = (PAPER, HERE, SCENEFUSE, NULL)
+_HEADINGS = (PAPER, HERE, NULL)
 VARIANTS = ("full", "no_scale", "no_crop")
 """The registration of the paper's Tables 2 and 3, and those of its ablation, Table 4."""
 ASSETS = importlib.resources.files("scenefuse.paper") / "assets"
@@ -52,50 +51,28 @@ OBJECTS = ("house", "balloon", "sculpture")
 _NOTHING = {"registration": "no point of the object within tau", "completion": "too few points were added"}
 
 
-@dataclass(frozen=True)
-class ComparisonSettings:
-    """What the paper's preset is compared with."""
-
-    compared_with: str = setting("../results")
-    """Results of a finished run of the shipped recipe on the same photos, for the column scenefuse of paper.tsv (recipe
-    `paper` only). Without such a run there the column is empty, and paper.tsv says why."""
-
-
-def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: Path, section: Path, seed: int) -> None:
+def compare_with_paper(*, run: RunInputs, table: Path, section: Path, seed: int) -> None:
     """Write the paper's Tables 2 to 4 (He et al. 2026) for the objects that lie in a scene.
 
-    The definition in a row is that of this run's number, the shipped recipe's and the null; the published numbers are
-    of the paper's own captures, at thresholds that it does not give. What does not exist is '-', and `note` says why.
-    The null is on this run's crop or, where this run did not come so far, on the other's, as `note` says. No truth is
-    read.
+    The definition in a row is that of this run's number and the null; the published numbers are of the paper's own
+    captures, at thresholds that it does not give. What does not exist is '-', and `note` says why. No truth is read.
 
     Args:
         run: this run; see RunInputs.
-        settings: see ComparisonSettings.
         table: output, TSV: one row an object, table, variant and measure.
         section: output, HTML: the same as a section of the report page.
         seed: of the random clouds that give the null.
     """
-    results = Path(settings.compared_with)
-    beside = _of_other_results(run, results)
-    unfinished = "" if (results / "summary/summary.txt").is_file() else f"{results} holds no finished run"
     rows: list[dict[str, Any]] = []
-    for place, (item, other) in enumerate(zip(summarise(run).objects, summarise(beside).objects)):
+    for folder, item in zip(run.objects, summarise(run).objects):
         if item.alone:
             continue
-        folder, its_folder = run.objects[place], beside.objects[place]
-        scene = next(k for k, path in enumerate(run.scenes) if path.name == run.scene_of[place])
-        pairs = [(folder, its_folder), (run.scenes[scene], beside.scenes[scene])]
-        why = unfinished or why_not_comparable(pairs, item, other)
+        nothing = Column(notes=dict.fromkeys(VARIANTS, "the run did not come as far as a pose"))
         columns = {
             PAPER: Column(published(item.name), measured=False),
             HERE: column_of(item),
-            SCENEFUSE: without(why) if why else column_of(other),
+            NULL: null_of(folder, item, seed) or nothing,
         }
-        null = null_of(folder, item, seed)
-        if null is None and not why and (null := null_of(its_folder, other, seed)) is not None:
-            null = replace(null, notes=dict.fromkeys(VARIANTS, "on the crop of the run scenefuse"))
-        columns[NULL] = null or without("no run came as far as a pose")
         rows += paper_rows(item.name, columns)
     with atomic_file(table) as temporary:
         pd.DataFrame(rows).to_csv(temporary, sep="\t", index=False, na_rep="-", float_format="%.6g")
@@ -104,44 +81,6 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
         temporary.write_text(paper_section(written.to_dict("records")), encoding="utf-8")
     for note in dict.fromkeys(f"{row['object']}: {row['note']}" for row in rows if row["note"]):
         print(note, flush=True)
-
-
-def _of_other_results(run: RunInputs, results: Path) -> RunInputs:
-    """The same scenes and objects in other results, whose depth maps may be split into other jobs."""
-    return replace(
-        run,
-        chunks=0,
-        jobs=JobRecords(results / "logs", results / "benchmarks"),
-        scenes=tuple(results / "scenes" / folder.name for folder in run.scenes),
-        objects=tuple(results / "objects" / folder.name for folder in run.objects),
-    )
-
-
-def why_not_comparable(pairs: list[tuple[Path, Path]], item: ObjectSummary, other: ObjectSummary) -> str:
-    """Why what another run made of an object cannot stand beside this run's, or "".
-
-    Args:
-        pairs: this run's folder and the other's, of the object and of its scene.
-        item: what this run made of the object.
-        other: what the other one did.
-    """
-    # Only the paper's stage 1 says whose poses it gives, and only the paper's registration has no gate.
-    if find(other.stages, "stage1.pose_source") is not None or other.status("full") == "ungated":
-        return f"{pairs[0][1]} is of recipe paper itself"
-    try:
-        for own, its in pairs:
-            if _taken_from(own) != _taken_from(its):
-                return f"{its} is of other photos than {own}"
-    except StageError as error:
-        return str(error)
-    return ""
-
-
-def _taken_from(folder: Path) -> Any:
-    """What tells the photos of an object or a scene from others; of one without photos, the size of its cloud."""
-    if (folder / "photos.json").is_file():
-        return sorted(photo["sha256"] for photo in read_json(folder / "photos.json").get("photos", []))
-    return [find(load(folder / name), "points") for name in ("object.json", "dense.json")]
 
 
 def paper_section(rows: list[dict[str, str]]) -> str:
@@ -227,11 +166,6 @@ def _told(item: ObjectSummary) -> str:
     return "; ".join(text.format(find(item.stages, key)) for key, text in said.items() if key in item.stages)
 
 
-def without(reason: str) -> Column:
-    """A column that is empty for a reason."""
-    return Column(notes=dict.fromkeys(VARIANTS, reason))
-
-
 def null_of(folder: Path, item: ObjectSummary, seed: int) -> Column | None:
     """What the measures give for nothing, on a run's crop and by its tau; None where the run did not come so far.
 
@@ -278,7 +212,7 @@ def paper_rows(name: str, columns: Mapping[str, Column]) -> list[dict[str, Any]]
     rows = []
     for table, variant, measure in ROWS:
         key, about = (measure, variant), MEASURES[measure]
-        units = [columns[h].cells[key][1] for h in (HERE, SCENEFUSE, NULL, PAPER) if key in columns[h].cells]
+        units = [columns[h].cells[key][1] for h in (HERE, NULL, PAPER) if key in columns[h].cells]
         unit = units[0] if units else None
         row: dict[str, Any] = {"object": name, "table": table, "variant": variant, "measure": measure}
         row |= {"in_paper": about["in_paper"], "definition": about["definition"], "unit": unit}

@@ -32,7 +32,6 @@ from scenefuse.paper.compare_with_paper import (
     NULL,
     OBJECTS,
     PAPER,
-    SCENEFUSE,
     VARIANTS,
     column_of,
     null_of,
@@ -51,7 +50,7 @@ POSES = {
     "rotation error of one motion (deg)": "pose_network_rotation_error_deg",
     "shift error of one motion over its length": "pose_network_translation_error",
 }
-CHAINED, FROM_SFM, SHIPPED = "paper preset, chained poses", "paper preset, SfM's poses", SCENEFUSE
+CHAINED, FROM_SFM, SHIPPED = "paper preset, chained poses", "paper preset, SfM's poses", "scenefuse"
 NULLS = {CHAINED: f"{NULL} of the preset, chained poses", FROM_SFM: f"{NULL} of the preset, SfM's poses"}
 # Of the true depth maps that the null is measured on.
 WIDTH_PX = 160

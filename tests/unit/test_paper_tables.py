@@ -17,25 +17,18 @@ from scenefuse.paper.compare_with_paper import (
     OBJECTS,
     PAPER,
     PUBLISHED,
-    SCENEFUSE,
-    ComparisonSettings,
     compare_with_paper,
     paper_section,
     published,
 )
 from scenefuse.report.run_summary import RunInputs
-from scenefuse.report.values import load
 from scenefuse.report.write_report import write_report
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("house", "shed")
-OWN, SHIPPED = "paper/results", "results"
+OWN = "paper/results"
 STAGES = ("matches", "sparse", "undistorted", "masks", "stage2", "stage3", "stage4", "object", "alignment")
 COMPLETION = {"surface_variation": 0.1, "nue": 1.5, "nue_density_invariant": 1.2, "primitive_fitting_score": 0.8}
-
-
-def photos_of(name, digest=""):
-    return {"photos": [{"name": "0.jpg", "sha256": digest or f"of {name}"}]}
 
 
 def registration_of(fitness, unit, diagonal=10.0):
@@ -44,20 +37,19 @@ def registration_of(fitness, unit, diagonal=10.0):
     return {name: quantity(number, u) for name, (number, u) in found.items()}
 
 
-def write_object(folder, recipe, fitness, unit="m"):
+def write_object(folder, fitness, unit="m"):
     """An object that went through: fitness as given in `full`, a half of it in `no_scale`, a quarter in `no_crop`."""
-    write_json(folder / "photos.json", photos_of(folder.name))
+    write_json(folder / "photos.json", {})
     (folder / "features.db").touch()
     for stage in STAGES:
         write_json(folder / f"{stage}.json", {})
-    write_json(folder / "stage1.json", {"pose_source": quantity("sfm", "")} if recipe == "paper" else {})
-    if recipe == "paper":
-        drawn = {"rays_per_epoch": 60_000, "rays_per_epoch_paper": 519_951, "prior_confident_share": 0.93}
-        drawn |= {"field_is_the_papers": False}
-        write_json(folder / "stage2.json", {name: quantity(number, "1") for name, number in drawn.items()})
+    write_json(folder / "stage1.json", {"pose_source": quantity("sfm", "")})
+    drawn = {"rays_per_epoch": 60_000, "rays_per_epoch_paper": 519_951, "prior_confident_share": 0.93}
+    drawn |= {"field_is_the_papers": False}
+    write_json(folder / "stage2.json", {name: quantity(number, "1") for name, number in drawn.items()})
     rng = np.random.default_rng(0)
     write_cloud(folder / "object.ply", Cloud(rng.uniform(0, 1, (300, 3))))
-    status = quantity("ungated" if recipe == "paper" else "registered", "")
+    status = quantity("ungated", "")
     for share, variant in ((1, "full"), (2, "no_scale"), (4, "no_crop")):
         registered = folder / "registration" / variant
         write_json(registered / "crop.json", {"diagonal": quantity(10.0, unit)})
@@ -77,15 +69,15 @@ def write_object(folder, recipe, fitness, unit="m"):
         write_json(folder / f"{name}.json", {})
 
 
-def write_run(results, recipe, fitness):
-    """A finished run."""
+def write_run(results, fitness):
+    """A finished run of the paper's recipe."""
     scene = results / "scenes/yard"
     for name in ("matches", "sparse", "georeference", "undistorted", "dense", "depth/0"):
         write_json(scene / f"{name}.json", {})
-    write_json(scene / "photos.json", photos_of("yard"))
+    write_json(scene / "photos.json", {})
     (scene / "features.db").touch()
     for name in NAMES:
-        write_object(results / "objects" / name, recipe, fitness)
+        write_object(results / "objects" / name, fitness)
     (results / "summary").mkdir(exist_ok=True)
     (results / "summary/summary.txt").write_text("all well\n")
 
@@ -100,13 +92,12 @@ def fail(results, name, words):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A run of the shipped recipe (fitness 0.9) and, beside it, one of the paper's (0.4)."""
-    write_run(tmp_path / SHIPPED, "scenefuse", 0.9)
-    write_run(tmp_path / OWN, "paper", 0.4)
+    """A run of fitness 0.4."""
+    write_run(tmp_path / OWN, 0.4)
     return tmp_path
 
 
-def compared(folder, compared_with=SHIPPED):
+def compared(folder):
     """Rows of paper.tsv by object, table, variant and measure."""
     results = folder / OWN
     run = RunInputs(
@@ -118,8 +109,7 @@ def compared(folder, compared_with=SHIPPED):
         scene_of=("yard",) * len(NAMES),
     )
     table = results / "summary/paper.tsv"
-    settings = ComparisonSettings(str(folder / compared_with))
-    compare_with_paper(run=run, settings=settings, table=table, section=table.with_suffix(".html"), seed=0)
+    compare_with_paper(run=run, table=table, section=table.with_suffix(".html"), seed=0)
     read = pd.read_csv(table, sep="\t", na_values=["-"], keep_default_na=False)
     return read.set_index(["object", "table", "variant", "measure"])
 
@@ -127,12 +117,12 @@ def compared(folder, compared_with=SHIPPED):
 def test_each_number_stands_in_its_column_and_row(folder):
     table = compared(folder)
     row = table.loc[("house", 2, "full", "fitness")]
-    assert row[[PAPER, HERE, SCENEFUSE]].tolist() == [0.9302, 0.4, 0.9]
-    assert table.loc[("house", 4, "no_scale", "fitness"), [PAPER, HERE, SCENEFUSE]].tolist() == [0.3083, 0.2, 0.45]
+    assert row[[PAPER, HERE]].tolist() == [0.9302, 0.4]
+    assert table.loc[("house", 4, "no_scale", "fitness"), [PAPER, HERE]].tolist() == [0.3083, 0.2]
     rmse = table.loc[("house", 4, "no_crop", "inlier_rmse")]
-    assert rmse[[PAPER, HERE, SCENEFUSE]].tolist() == [0.4424, 0.025, 0.05625] and rmse["unit"] == "m"
-    nue = table.loc[("house", 3, "full", "nue"), [PAPER, HERE, SCENEFUSE, NULL]].tolist()
-    assert nue == [1.17, pytest.approx(0.6), pytest.approx(1.35), 0.15]
+    assert rmse[[PAPER, HERE]].tolist() == [0.4424, 0.025] and rmse["unit"] == "m"
+    nue = table.loc[("house", 3, "full", "nue"), [PAPER, HERE, NULL]].tolist()
+    assert nue == [1.17, pytest.approx(0.6), 0.15]
     assert table["note"].isna().all() and len(table) == 2 * 16
     said = (
         "stages 2 to 4 have the poses of: sfm; rays an epoch in stages 2 and 4: 60000; every pixel of the object once:"
@@ -188,75 +178,24 @@ def test_the_null_is_a_random_cloud_on_the_crop_whatever_the_object_is(folder):
     assert compared(folder)[NULL].equals(null)
 
 
-def test_an_object_that_failed_is_empty_with_the_reason_and_the_null_is_the_other_run_s(folder):
-    own = compared(folder)[NULL]
+def test_an_object_that_failed_is_empty_with_the_reason_and_leaves_the_others(folder):
     fail(folder / OWN, "house", "the visual hull of the masks is empty")
     table = compared(folder)
     house = table.loc["house"]
-    assert house[HERE].isna().all() and house[SCENEFUSE].notna().all()
+    assert house[HERE].isna().all() and house[NULL].isna().all()
     assert house["note"].str.contains(r"failed, the visual hull of the masks is empty \[train_nerf_as_paper/").all()
-    assert (
-        house[NULL].equals(own["house"]) and house["note"].str.contains("null: on the crop of the run scenefuse").all()
-    )
+    assert house["note"].str.contains("null: the run did not come as far as a pose").all()
     assert table.loc["shed", HERE].notna().all() and table.loc["shed", "note"].isna().all()
-
-
-def test_without_any_other_run_the_rest_of_the_table_is_made(folder):
-    table = compared(folder, "elsewhere/results")
-    assert table[SCENEFUSE].isna().all() and table[[HERE, NULL]].notna().all(axis=None)
-    assert table["note"].str.fullmatch(r"scenefuse: \S+/elsewhere/results holds no finished run").all()
-    for name in NAMES:
-        fail(folder / OWN, name, "no volume")
-    assert compared(folder, "elsewhere/results")["note"].str.contains("null: no run came as far as a pose").all()
-
-
-def rewrite(folder, file, **changes):
-    path = folder / SHIPPED / file
-    write_json(path, load(path) | changes)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (lambda f: (f / SHIPPED / "summary/summary.txt").unlink(), "holds no finished run"),
-        (lambda f: write_run(f / SHIPPED, "paper", 0.9), "is of recipe paper itself"),
-        (lambda f: (f / SHIPPED / "scenes/yard").rename(f / SHIPPED / "scenes/lawn"), "scenes/yard is of other photos"),
-    ],
-    ids=["no summary", "recipe paper", "other scene"],
-)
-def test_a_run_that_does_not_belong_there_gives_no_number_and_is_named(folder, spoil, words):
-    spoil(folder)
-    table = compared(folder)
-    assert table[SCENEFUSE].isna().all() and table[HERE].notna().all()
-    assert table["note"].str.contains(words, regex=False).all()
-
-
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (lambda house: (house / "photos.json").write_text("{"), "is not valid JSON"),
-        (lambda house: write_json(house / "photos.json", photos_of("house", "other")), "is of other photos than"),
-        (lambda house: house.rename(house.with_name("barn")), "house is of other photos than"),
-        (lambda house: (house / "masks.json").unlink(), "scenefuse: missing, no error in its logs"),
-        (lambda house: fail(house.parents[1], "house", "no surface"), "scenefuse: failed, no surface"),
-    ],
-    ids=["damaged", "photos", "not in it", "being made again", "failed"],
-)
-def test_an_object_that_cannot_be_compared_gives_no_number_and_leaves_the_others(folder, spoil, words):
-    spoil(folder / SHIPPED / "objects/house")
-    table = compared(folder)
-    assert table.loc["house", SCENEFUSE].isna().all() and table.loc["shed", SCENEFUSE].notna().all()
-    assert table.loc["house", "note"].str.contains(words, regex=False).all() and table.loc["shed", "note"].isna().all()
 
 
 def test_a_pose_that_was_refused_is_said_beside_its_numbers(folder):
     why = {"status": quantity("unregistered", ""), "reason": quantity("two poses fit", "")}
     write_json(
-        folder / SHIPPED / "objects/house/registration/full/fine.json", why | {"scene_from_object": quantity(None, "")}
+        folder / OWN / "objects/house/registration/full/fine.json", why | {"scene_from_object": quantity(None, "")}
     )
     table = compared(folder)
-    assert table.loc[("house", 2, "full"), SCENEFUSE].notna().all()
-    assert set(table.loc[("house", 2, "full"), "note"]) == {"scenefuse: unregistered, two poses fit"}
+    assert table.loc[("house", 2, "full"), HERE].notna().all()
+    assert set(table.loc[("house", 2, "full"), "note"]) == {f"{HERE}: unregistered, two poses fit"}
     assert table.loc[("house", 4), "note"].isna().all()
 
 
@@ -264,30 +203,29 @@ def test_a_variant_that_did_not_run_and_a_measure_of_nothing_are_said(folder):
     metrics = folder / OWN / "objects/house/metrics.json"
     own = {"registration": registration_of(0.0, "m") | {"inlier_rmse": quantity(None, "m")}}
     write_json(metrics, own | {"completion": {name: quantity(None, "1") for name in COMPLETION}})
-    shutil.rmtree(folder / SHIPPED / "objects/house/registration/no_crop")
+    shutil.rmtree(folder / OWN / "objects/house/registration/no_crop")
     table = compared(folder)
     assert table.loc[("house", 2, "full", "inlier_rmse"), "note"] == f"{HERE}: no point of the object within tau"
     assert table.loc[("house", 3, "full", "nue"), "note"].startswith(f"{HERE}: too few points were added")
     assert set(table.loc[("house", 4, "no_crop"), "note"]) == {
-        "scenefuse: missing, no error in its logs; it has not run yet"
+        f"{HERE}: missing, no error in its logs; it has not run yet"
     }
     assert table.loc[("house", 4, "no_scale"), "note"].isna().all()
 
 
 def test_lengths_in_another_unit_are_left_out_and_said(folder):
-    write_object(folder / SHIPPED / "objects/house", "scenefuse", 0.8, unit="scene units")
+    write_object(folder / OWN / "objects/house", 0.8, unit="scene units")
     table = compared(folder)
     row = table.loc[("house", 2, "full", "inlier_rmse")]
-    assert np.isnan(row[SCENEFUSE]) and row["note"] == "scenefuse: 0.2 scene units, in another unit"
-    assert table.loc[("house", 2, "full", "fitness"), SCENEFUSE] == 0.8
+    assert np.isnan(row[PAPER]) and row["note"] == f"{PAPER}: 0.0852 m, in another unit" and row[HERE] == 0.2
+    assert table.loc[("house", 2, "full", "fitness"), PAPER] == 0.9302
 
 
 def test_the_truth_changes_nothing(folder):
     before = compared(folder)
-    for results in (OWN, SHIPPED):
-        for name in NAMES:
-            truth = {"variants": {"full": {"fitness": quantity(0.123, "1")}}, "fitness": quantity(0.123, "1")}
-            write_json(folder / results / f"objects/{name}/truth.json", truth)
+    for name in NAMES:
+        truth = {"variants": {"full": {"fitness": quantity(0.123, "1")}}, "fitness": quantity(0.123, "1")}
+        write_json(folder / OWN / f"objects/{name}/truth.json", truth)
     assert compared(folder).equals(before)
 
 
@@ -307,7 +245,7 @@ def test_the_page_shows_the_tables_with_definitions_reasons_and_figures(folder):
     assert "no &lt;volume&gt;" in page and "<volume>" not in page
     assert "fitness  (Fitness): share of the crop&#x27;s points" in text
     assert all(f"Figure {number}" in text for number in (2, 3, 5)) and "before_after.png" in text
-    assert re.search(r"house\s+full\s+1\s+0\.9302\s+-\s+0\.9\s", text)
+    assert re.search(r"house\s+full\s+1\s+0\.9302\s+-\s+-\s", text)
 
 
 def test_the_page_of_another_recipe_shows_no_table_of_before(folder):
@@ -326,7 +264,6 @@ def test_the_page_says_which_variant_a_note_is_about():
         "unit": "1",
         PAPER: "-",
         HERE: "1",
-        SCENEFUSE: "2",
         NULL: "-",
     }
     places = [("2", "full", "fitness"), ("3", "full", "nue"), ("4", "no_crop", "fitness"), ("4", "no_crop", "tau")]

@@ -220,19 +220,8 @@ use rule register_as_paper as register_variant_as_paper with:
         "{wildcards.object}, variant {wildcards.variant}: registration by the paper's recipe"
 
 
-def state_of_compared(wildcards):
-    """Params function: fingerprint of what the run compared with says of the same objects."""
-    results = Path(config["evaluation"]["paper"]["compared_with"])
-    files = [results / "summary/summary.txt"]
-    for folder in (results / "scenes" / name for name in SCENES):
-        files += [folder / "photos.json", folder / "dense.json"]
-    for folder in (results / "objects" / name for name in JOINED):
-        files += [*folder.glob("*.json"), *folder.glob("registration/*/*.json")]
-    return files_fingerprint(tuple(map(str, files)))
-
-
 rule compare_with_paper:
-    """Tables 2, 3 and 4 of the paper: its own numbers, those of this run and of the shipped recipe's, and chance."""
+    """Tables 2, 3 and 4 of the paper: its own numbers, those of this run, and chance."""
     input:
         "results/summary/summary.txt",
     output:
@@ -253,13 +242,11 @@ rule compare_with_paper:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         run=run_options,
-        options=flags(config["evaluation"]["paper"]),
-        files=state_of_compared,
         seed=config["seed"],
         script=script("paper/compare_with_paper.py"),
         code=code("paper/compare_with_paper.py"),
     message:
         "Summary: the paper's tables"
     shell:
-        "exec python {params.script} {params.run} {params.options} --table {output.table} --section {output.section}"
+        "exec python {params.script} {params.run} --table {output.table} --section {output.section}"
         " --seed {params.seed} &> {log}"
