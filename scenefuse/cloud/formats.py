@@ -1,5 +1,5 @@
 """Point cloud files of any known ending as named columns: PLY, LAS and LAZ (COPC too), E57, PCD, rows of text, and
-meshes (PLY with faces, OBJ, GLB), from whose faces points are drawn.
+meshes (PLY with faces, OBJ, glTF), from whose faces points are drawn.
 
 Columns have the names that PLY uses (x, y, z, nx, ny, nz, red, green, blue); all others keep their own. Positions keep
 the precision of the file. Libraries are loaded when a file needs them. A new format is a reader in READERS.
@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, POSITION, Columns, common_names
+from scenefuse.cloud.readers.columns import AT_ONCE, POSITION, Columns, named
 from scenefuse.cloud.readers.e57 import read_e57
 from scenefuse.cloud.readers.las import check_projected, las_crs, read_las
-from scenefuse.cloud.readers.meshes import read_glb, read_obj
+from scenefuse.cloud.readers.meshes import read_gltf, read_obj
 from scenefuse.cloud.readers.pcd import read_pcd
 from scenefuse.cloud.readers.ply import in_rows, read_ply
 from scenefuse.cloud.readers.text import TEXTS, read_text
@@ -29,7 +29,8 @@ ColumnParts = Callable[[], Iterator[Columns]]
 READERS: dict[str, Callable[[Path, int], Iterator[Columns]]] = {
     ".ply": read_ply,
     ".obj": lambda path, _: iter([read_obj(path)]),
-    ".glb": lambda path, _: iter([read_glb(path)]),
+    ".glb": lambda path, _: iter([read_gltf(path)]),
+    ".gltf": lambda path, _: iter([read_gltf(path)]),
     ".las": read_las,
     ".laz": read_las,
     ".e57": read_e57,
@@ -70,7 +71,7 @@ def columns_in_parts(path: Path, degrees: bool = False) -> ColumnParts:
     with readable(path):
         if not degrees:
             check_projected(path)
-        is_mesh = ending in (".obj", ".glb") or (ending == ".ply" and not in_rows(path))
+        is_mesh = ending in (".obj", ".glb", ".gltf") or (ending == ".ply" and not in_rows(path))
     if is_mesh:
         held = list(parts())
         return lambda: iter(held)
@@ -105,15 +106,8 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def _checked(path: Path, columns: Columns) -> Columns:
-    """Columns by their common names, the colours of Gaussian splats among them; StageError without positions."""
-    columns = dict(zip(common_names(list(columns)), columns.values()))
-    if {"f_dc_0", "f_dc_1", "f_dc_2"} <= set(columns) and not set(COLOR) & set(
-        columns
-    ):  # spherical harmonics, degree 0
-        shares = [0.5 + columns[f"f_dc_{k}"] / np.sqrt(4 * np.pi) for k in range(3)]
-        columns |= {
-            name: np.rint(255 * np.nan_to_num(share).clip(0, 1)).astype(np.uint8) for name, share in zip(COLOR, shares)
-        }
+    """Columns by their common names; StageError without positions."""
+    columns = named(columns)
     if not set(POSITION) <= set(columns):
         raise StageError(f"{path} has no columns x, y and z but {', '.join(columns) or 'none'}; export it again")
     return columns

@@ -297,7 +297,7 @@ def test_truncated_files_are_refused(tmp_path, cloud):
 
 
 def test_an_unknown_ending_lists_the_known_ones(tmp_path):
-    with pytest.raises(StageError, match=r"\.abc.*\.ply, \.obj, \.glb, \.las, \.laz, \.e57, \.pcd, \.xyz"):
+    with pytest.raises(StageError, match=r"\.abc.*\.ply, \.obj, \.glb, \.gltf, \.las, \.laz, \.e57, \.pcd, \.xyz"):
         read_cloud(tmp_path / "a.abc")
 
 

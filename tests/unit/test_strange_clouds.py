@@ -2,6 +2,7 @@
 right."""
 
 import io
+import json
 import struct
 from base64 import b64encode
 from pathlib import Path
@@ -328,6 +329,78 @@ def test_packed_colours_of_pcd_as_a_real_number_or_an_integer(tmp_path, data, ki
     assert read.colors.tolist() == COLORS and not read.fields
 
 
+@pytest.mark.parametrize("name", ["rgb", "RGBA"])
+@pytest.mark.parametrize("kind", ["a.csv", "a.txt", "integers.ply", "reals.ply"])
+def test_packed_colours_are_read_of_text_and_ply(tmp_path, name, kind):
+    packed = np.array([r << 16 | g << 8 | b for r, g, b in COLORS], np.uint32)
+    if kind == "a.csv":
+        (tmp_path / kind).write_text(f"x,y,z,{name}\n" + "\n".join(rows(",", packed)))
+    elif kind == "a.txt":  # the real numbers of these bits
+        (tmp_path / kind).write_text(f"x y z {name}\n" + "\n".join(rows(" ", packed.view(np.float32).astype(float))))
+    else:
+        vertex = np.zeros(40, [(axis, "f4") for axis in "xyz"] + [(name, "u4" if kind == "integers.ply" else "f4")])
+        vertex["x"], vertex["y"], vertex["z"] = np.array(GRID).T
+        vertex[name] = packed.view(vertex[name].dtype)
+        PlyData([PlyElement.describe(vertex, "vertex")]).write(tmp_path / kind)
+    read = read_cloud(tmp_path / kind)
+    assert read.colors.tolist() == COLORS and not read.fields
+    (tmp_path / "shares.csv").write_text(f"x,y,z,{name}\n" + "\n".join(rows(",", np.linspace(0, 0.9, 40))))
+    assert read_cloud(tmp_path / "shares.csv").colors is None
+
+
+def write_las(path, form, count):
+    """The grid as LAS or LAZ, whose header counts so many points."""
+    las = laspy.LasData(laspy.LasHeader(point_format=form, version="1.2" if form < 6 else "1.4"))
+    las.x, las.y, las.z = np.array(GRID).T
+    las.write(str(path))
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<I", content, 107, count if form < 6 else 0)
+    if form >= 6:
+        struct.pack_into("<Q", content, 247, count)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("count", [0, 25])
+@pytest.mark.parametrize("name", ["a.las", "b.las", "b.laz", "text.ply", "binary.ply", "ascii.pcd", "binary.pcd"])
+def test_a_file_that_holds_more_points_than_its_header_counts_is_refused(tmp_path, name, count):
+    path, points = tmp_path / name, np.array(GRID, "<f4")
+    if path.suffix in (".las", ".laz"):
+        write_las(path, 6 if path.stem == "b" else 0, count)
+    elif path.suffix == ".ply":
+        form = {"text": "ascii", "binary": "binary_little_endian"}[path.stem]
+        head = HEAD.format(count).replace("ascii", form) + "end_header\n"
+        path.write_bytes(head.encode() + ("\n".join(rows()).encode() if form == "ascii" else points.tobytes()))
+    else:
+        head = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {count}\nHEIGHT 1\nDATA {path.stem}\n"
+        path.write_bytes(head.encode() + ("\n".join(rows()).encode() if path.stem == "ascii" else points.tobytes()))
+    with pytest.raises(StageError, match=f"{name} holds more points than the {count} that its header counts; export"):
+        CloudFile.of(path)
+
+
+def test_bytes_behind_all_points_of_las_that_are_no_rows_are_none(tmp_path):
+    write_las(tmp_path / "a.las", 0, 40)
+    with open(tmp_path / "a.las", "ab") as file:
+        file.write(bytes(7))
+    assert len(CloudFile.of(tmp_path / "a.las").part) == 40
+
+
+@pytest.mark.parametrize(("name", "right"), [("PNEZD", True), ("penz", True), ("ENZ", True), ("points", False)])
+def test_a_row_of_a_surveyor_that_one_word_names(tmp_path, name, right):
+    letters = [letter for letter in name.upper() if letter in "PNEZD"] if right else list("PNEZD")
+    table = dict(zip("ENZ", np.array(GRID).T)) | {"P": np.arange(7, 47), "D": ["tree"] * 40}
+    lines = [",".join(map(str, row)) for row in zip(*(table[letter] for letter in letters))]
+    (tmp_path / "a.csv").write_text(f"{name}\n" + "\n".join(lines))
+    read = CloudFile.of(tmp_path / "a.csv")
+    assert np.allclose(read.part.points, GRID) == right
+    assert right or any("left out; the next three are x, y and z" in note for note in read.notes)
+
+
+def test_coordinates_in_different_units_are_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("X [m],Y [m],Z [mm]\n" + "\n".join(rows(",")))
+    with pytest.raises(StageError, match="has x, y and z in m, mm; export all three in one unit"):
+        read_cloud(tmp_path / "a.csv")
+
+
 def test_returns_at_the_scanner_s_own_place_are_no_points(tmp_path):
     around = np.vstack([np.array(GRID) - [4, 3, 2], np.zeros((12, 3))])
     write_cloud(tmp_path / "lidar.ply", Cloud(around))
@@ -346,6 +419,20 @@ def test_a_mesh_in_ply_of_text_with_blank_lines_and_numbers_with_a_point(tmp_pat
     read = read_cloud(tmp_path / "a.ply")
     assert np.allclose(read.normals, [0, 0, 1]) and (read.colors == [255, 0, 0]).all()
     assert np.ptp(read.points, axis=0).round(2).tolist() == [1, 1, 0]
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_strips_of_triangles_in_ply_are_faces_that_look_outwards(tmp_path, text):
+    vertex = np.zeros(6, [(axis, "f4") for axis in "xyz"])
+    vertex["x"], vertex["y"] = np.repeat([0, 1, 2], 2), [0, 1] * 3
+    strips = np.empty(1, [("vertex_indices", "O")])
+    strips["vertex_indices"][0] = np.array([0, 2, 1, 3, -1, 2, 4, 3, 5], np.int32)
+    elements = [PlyElement.describe(vertex, "vertex")]
+    elements.append(PlyElement.describe(strips, "tristrips", val_types={"vertex_indices": "i4"}))
+    PlyData(elements, text).write(tmp_path / "a.ply")
+    read = read_cloud(tmp_path / "a.ply")
+    assert len(read) == 500_000 and np.allclose(read.normals, [0, 0, 1])
+    assert np.allclose(read.points.mean(0), [1, 0.5, 0], atol=1e-3)
 
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -450,6 +537,30 @@ def test_numbers_of_a_big_endian_ply_are_written_as_they_were(tmp_path, faces):
     written = read_cloud(tmp_path / "b.ply")
     np.testing.assert_allclose(written.points, GRID)
     assert (written.fields["quality"] == 0.5).all() and (written.fields["class"] == 7).all()
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_a_gltf_has_its_buffer_and_picture_in_files_beside_it_or_in_itself(tmp_path, inside):
+    kept = {}
+
+    def change(document):
+        view = document["bufferViews"][3]
+        document["images"] = [{"uri": "my%20picture.png"}]
+        document["buffers"] = [{"uri": "square.bin", "byteLength": view["byteOffset"] + view["byteLength"]}]
+        kept.update(document)
+
+    glb(tmp_path / "a.glb", change)
+    content = (tmp_path / "a.glb").read_bytes()
+    blob = content[28 + int.from_bytes(content[12:16], "little") :]
+    halves(tmp_path / "my picture.png")
+    if inside:
+        kept["buffers"][0]["uri"] = "data:application/octet-stream;base64," + b64encode(blob).decode()
+    (tmp_path / "a.gltf").write_text(json.dumps(kept))
+    if not inside:
+        with pytest.raises(StageError, match="a.gltf: its square.bin is missing or cut short; put it beside it"):
+            read_cloud(tmp_path / "a.gltf")
+        (tmp_path / "square.bin").write_bytes(blob)
+    assert sides(tmp_path / "a.gltf")[:2] == pytest.approx([0.25, 0.75], abs=0.01)
 
 
 @pytest.mark.parametrize("kind", ["diffuse", "emissive", "data"])

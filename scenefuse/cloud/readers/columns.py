@@ -9,6 +9,7 @@ import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,8 @@ OTHER_NAMES = {name: name for name in (*POSITION, *NORMAL)} | {
 }
 # What may stand before or behind the name of a column: whose colour it is, a unit, a range.
 AROUND = re.compile(r"^(diffuse|colou?r|rgb|scalar|vertex|farbe|couleur)(?=.)|[\[(].*$")
+# What PCL calls colours whose bytes are those of one number, whatever its type.
+PACKED = ("rgb", "rgba")
 # Around the number in a cell: quotes, blanks, and a byte order mark, whole or read as three letters.
 STRIPPED = " \t\"'\ufeff\u00ef\u00bb\u00bf"
 # A comment behind numbers; spreadsheets write #N/A.
@@ -58,6 +61,51 @@ def common_names(names: Sequence[str]) -> list[str]:
         for axis, (first, *_) in zip(COLOR, colored):
             found[first] = axis
     return found
+
+
+def named(columns: Columns) -> Columns:
+    """Columns by their common names; packed colours, and those of Gaussian splats (spherical harmonics, degree 0), as
+    red, green and blue."""
+    found = dict(zip(common_names(list(columns)), columns.values()))
+    if set(COLOR) & set(found):
+        return found
+    if {"f_dc_0", "f_dc_1", "f_dc_2"} <= set(found):
+        shares = [0.5 + found[f"f_dc_{k}"] / np.sqrt(4 * np.pi) for k in range(3)]
+        return found | {
+            name: np.rint(255 * np.nan_to_num(share).clip(0, 1)).astype(np.uint8) for name, share in zip(COLOR, shares)
+        }
+    name = next((name for name in found if name.lower() in PACKED), "")
+    bits = _bits(found[name]) if name else None
+    if bits is not None:
+        del found[name]
+        found |= {color: (bits >> shift & 255).astype(np.uint8) for color, shift in zip(COLOR, (16, 8, 0))}
+    return found
+
+
+def _bits(values: NDArray[Any]) -> NDArray[Any] | None:
+    """Packed colours (N,) as integers: the numbers, or the bits of real ones; None where these are shares."""
+    if values.dtype.kind != "f":
+        return values.astype(np.int64)
+    largest = np.abs(np.nan_to_num(values)).max(initial=0)
+    if 1 <= largest < 2**32:  # the integer itself, not the real number of its bits
+        return np.nan_to_num(values).astype(np.int64)
+    # Bits without opacity are the smallest of real numbers.
+    return None if 1e-30 < largest < 1 else values.astype(np.float32).view(np.uint32)
+
+
+def check_count(path: Path, counted: int, there: int, what: str = "points", advice: str = "copy it again") -> None:
+    """StageError where a file holds other than the points, or rows of another kind, that its header counts."""
+    if there < counted:
+        raise StageError(f"{path} is cut short: its last {counted - there} {what} are missing; {advice}")
+    if there > counted:
+        raise StageError(
+            f"{path} holds more {what} than the {counted} that its header counts; export it again, or correct that"
+        )
+
+
+def rows_behind(lines: Iterable[bytes], width: int) -> int:
+    """How many lines hold so many cells."""
+    return sum(len(line.split()) == width for line in lines)
 
 
 def positions(columns: Columns) -> NDArray[np.float64]:

@@ -2,12 +2,13 @@
 
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, POSITION, Columns
+from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, POSITION, Columns, check_count
 from scenefuse.core.stage import StageError
 
 ENDINGS = (".las", ".laz")
@@ -69,6 +70,8 @@ def read_las(path: Path, at_once: int) -> Iterator[Columns]:
 
     with laspy.open(path) as file:
         form, count = file.header.point_format, 0
+        if file.header.are_points_compressed:
+            check_count(path, file.header.point_count, max(file.header.point_count, _packed(path, file.header)))
         at_once = max(1, min(at_once, 256 * AT_ONCE // form.size))  # however wide the header says that a point is
         named = [*POSITION, *(COLOR if set(COLOR) <= set(form.dimension_names) else ())]
         for points in file.chunk_iterator(at_once):
@@ -81,16 +84,32 @@ def read_las(path: Path, at_once: int) -> Iterator[Columns]:
                 | own
                 | {name: values for name, values in extra.items() if values.ndim == 1 and name not in own}
             )
-        if count < file.header.point_count:
-            missing = file.header.point_count - count
-            raise StageError(f"{path} is cut short: its last {missing} points are missing; copy it again")
+        check_count(path, file.header.point_count, count)
+
+
+def _packed(path: Path, header: Any) -> int:
+    """How many points the chunks of a LAZ hold at least; 0 where it has no table of chunks."""
+    import lazrs
+
+    laszip = lazrs.LazVlr(header.vlrs.get("LasZipVlr")[0].record_data)
+    with open(path, "rb") as file, suppress(lazrs.LazrsError):
+        file.seek(header.offset_to_point_data)
+        chunks = lazrs.read_chunk_table(file, laszip)
+        counts = [count for count, _ in chunks]
+        if counts and not laszip.uses_variable_size_chunks():
+            counts[-1] = 1
+            if header.point_format.id >= 6:  # behind its first point, a chunk says how many it has
+                file.seek(sum(size for _, size in chunks[:-1]) + laszip.item_size(), 1)
+                counts[-1] = int.from_bytes(file.read(4), "little")
+        return sum(counts)
+    return 0
 
 
 def _check_header(path: Path) -> None:
-    """Refuse a header that counts more than the file holds, before a library believes it (LAS 1.4 R15, 2.4).
+    """Refuse a header that counts other than the file holds, before a library believes it (LAS 1.4 R15, 2.4).
 
     Raises:
-        StageError: the file is cut short.
+        StageError: the file is cut short, or holds more points.
         ValueError: it is no LAS file.
     """
     with open(path, "rb") as file:
@@ -99,11 +118,12 @@ def _check_header(path: Path) -> None:
         if len(head) < 227 or not head.startswith(b"LASF"):
             raise ValueError("it does not begin as LAS does")
         begin, records, kind, length, count = struct.unpack_from("<IIBHI", head, 96)
+        end = there
         if not np.isfinite(scales := struct.unpack_from("<3d", head, 131)).all() or not all(scales):
             raise ValueError(f"its coordinates count in steps of {scales}")
         if head[25] >= 4 and len(head) == 375:
             start, more, long_count = struct.unpack_from("<QIQ", head, 235)
-            count = long_count or count
+            count, end = long_count or count, min(struct.unpack_from("<Q", head, 227)[0] or there, start or there)
             for _ in range(more):  # extended records behind the points, each with its length
                 file.seek(min(start + 20, there))
                 start += 60 + int.from_bytes(file.read(8), "little")
@@ -111,9 +131,9 @@ def _check_header(path: Path) -> None:
                     raise StageError(f"{path} is cut short: its last records are missing; copy it again")
     if 54 * records > begin or length < 20:
         raise ValueError("its header counts more records than it holds")
-    missing = count - max(there - begin, 0) // length
-    if begin > there or (missing > 0 and not kind & 128):
-        raise StageError(f"{path} is cut short: its last {missing} points are missing; copy it again")
+    held, odd = divmod(max(end - begin, 0), length)
+    if begin > there or (not kind & 128 and (held < count or not odd)):
+        check_count(path, count, held)
 
 
 def _crs(header: Any) -> Any:

@@ -1,8 +1,9 @@
-"""Triangle meshes (PLY, OBJ, GLB) as points: drawn evenly from their faces, with normals and colours.
+"""Triangle meshes (PLY, OBJ, glTF) as points: drawn evenly from their faces, with normals and colours.
 
 Read here and not by Open3D, whose readers take positions as float32: at UTM coordinates that loses decimetres.
 """
 
+import codecs
 import io
 import json
 import re
@@ -11,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,6 +159,15 @@ def triangles(
         return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
     order = np.argsort(np.concatenate(of), kind="stable")
     return np.concatenate(corners)[order], np.concatenate(of)[order]
+
+
+def of_strip(index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(F, 3) triangles of strips (N,) with -1 between them; every second one has its corners turned."""
+    each = np.arange(len(index) - 2)
+    begins = np.maximum.accumulate(np.where(index == -1, np.arange(len(index)) + 1, 0))[: len(each)]
+    turned = (each - begins) % 2
+    found = index[np.stack([each, each + 1 + turned, each + 2 - turned], axis=1)]
+    return found[(found >= 0).all(1)]
 
 
 def _ears(points: Array, normal: Array) -> NDArray[np.int64]:
@@ -322,19 +333,15 @@ def _picture(content: bytes, name: str) -> NDArray[np.uint8] | None:
         return None
 
 
-def read_glb(path: Path) -> Columns:
-    """Binary glTF 2.0: all meshes of its scene at their places, turned so that z is up (glTF says that y is).
+def read_gltf(path: Path) -> Columns:
+    """glTF 2.0, in one file (GLB) or JSON with files beside it: all meshes of its scene at their places, turned so that
+    z is up (glTF says that y is).
 
     Raises:
-        ValueError: it is no GLB, holds no triangles, or its meshes are compressed.
+        ValueError: it is no glTF, holds no triangles, or its meshes are compressed.
     """
-    content = path.read_bytes()
-    if content[:4] != b"glTF" or len(content) < 20:
-        raise ValueError("it does not begin as GLB does")
-    if missing := max(int.from_bytes(content[8:12], "little") - len(content), 0):
-        raise StageError(f"{path} is cut short: its last {missing} bytes are missing; copy it again")
-    length = int.from_bytes(content[12:16], "little")
-    document, blob = json.loads(content[20 : 20 + length]), content[28 + length :]
+    content = _Gltf.of(path)
+    document = content.document
     unread = sorted(name for name in document.get("extensionsUsed", []) if not READ_EXTENSIONS.match(name))
     if packed := [name for name in unread if name.endswith("_compression")]:
         raise ValueError(f"its meshes are compressed by {packed[0]}: export them without")
@@ -343,7 +350,7 @@ def read_glb(path: Path) -> Columns:
     upright = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
     scenes, nodes = document.get("scenes"), document.get("nodes", [])
     roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
-    parts = [part for root in roots for part in _parts(document, blob, root, upright)]
+    parts = [part for root in roots for part in content.parts(root, upright)]
     if not parts:
         raise ValueError("it holds no triangles")
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
@@ -355,141 +362,173 @@ def read_glb(path: Path) -> Columns:
             np.concatenate(colored) if len(colored) == len(parts) else None,
             np.concatenate([np.full((len(p.faces), 3, 2), np.nan) if p.uvs is None else p.uvs for p in parts]),
             np.concatenate([part.material for part in parts]),
-            tuple(_gltf_material(document, blob, number) for number in range(len(document.get("materials", [])))),
+            tuple(content.material(number) for number in range(len(document.get("materials", [])))),
         )
     )
 
 
-def _parts(document: dict[str, Any], blob: bytes, node: int, outer: Array) -> list[Mesh]:
-    """The triangles below a node of glTF, in the frame that `outer` (4, 4) leads to."""
-    from scipy.spatial.transform import Rotation
+@dataclass(frozen=True)
+class _Gltf:
+    """The JSON of a glTF, its buffers, and the folder of the files that it names."""
 
-    about = document["nodes"][node]
-    if "matrix" in about:
-        own = np.array(about["matrix"], np.float64).reshape(4, 4).T
-    else:
-        own = np.eye(4)
-        turn = Rotation.from_quat(about.get("rotation", [0, 0, 0, 1])).as_matrix()
-        own[:3, :3], own[:3, 3] = turn * np.array(about.get("scale", [1, 1, 1])), about.get("translation", [0, 0, 0])
-    pose, found = outer @ own, list[Mesh]()
-    for primitive in document["meshes"][about["mesh"]]["primitives"] if "mesh" in about else []:
-        faces = _faces(document, blob, primitive)
-        if faces is None:
-            print("note: lines and points of the GLB are left out; triangles are read", flush=True)
-            continue
-        names, number = primitive["attributes"], primitive.get("material", -1)
-        vertices = _values(document, blob, names["POSITION"])
-        colors = 255 * _values(document, blob, names["COLOR_0"])[:, :3] if "COLOR_0" in names else None
-        uvs = None
-        if number >= 0 and (place := f"TEXCOORD_{_texture(document, number).get('texCoord', 0)}") in names:
-            uvs = _values(document, blob, names[place])[faces]
-        for instance in _instances(document, blob, about):
-            turn = pose @ instance
-            corners = faces if np.linalg.det(turn[:3, :3]) > 0 else faces[:, ::-1]
-            own_uvs = uvs if uvs is None or corners is faces else uvs[:, ::-1]
-            moved = vertices @ turn[:3, :3].T + turn[:3, 3]
-            found.append(Mesh(moved, corners, colors, own_uvs, np.full(len(faces), number)))
-    return found + [part for child in about.get("children", []) for part in _parts(document, blob, child, pose)]
+    document: dict[str, Any]
+    buffers: list[bytes]
+    folder: Path
 
+    @classmethod
+    def of(cls, path: Path) -> "_Gltf":
+        """A file with what lies beside it; StageError where a part is missing or cut short."""
+        content, blob = path.read_bytes(), b""
+        if content[:4] == b"glTF" and len(content) >= 20:
+            if missing := max(int.from_bytes(content[8:12], "little") - len(content), 0):
+                raise StageError(f"{path} is cut short: its last {missing} bytes are missing; copy it again")
+            length = int.from_bytes(content[12:16], "little")
+            content, blob = content[20 : 20 + length], content[28 + length :]
+        elif not content.lstrip(codecs.BOM_UTF8 + b" \t\r\n").startswith(b"{"):
+            raise ValueError("it does not begin as glTF does")
+        found = cls(json.loads(content), [], path.parent)
+        for about in found.document.get("buffers", [{}]):
+            buffer = found.content(about["uri"]) if "uri" in about else blob
+            if len(buffer) < about.get("byteLength", 0):
+                name = about.get("uri", "data")[:60]
+                raise StageError(f"{path}: its {name} is missing or cut short; put it beside it, or copy it again")
+            found.buffers.append(buffer)
+        return found
 
-def _faces(document: dict[str, Any], blob: bytes, primitive: dict[str, Any]) -> NDArray[np.int64] | None:
-    """The triangles (F, 3) of triangles, a strip or a fan (glTF 2.0, 3.7.2.1); None of lines and points."""
-    count = document["accessors"][primitive["attributes"]["POSITION"]]["count"]
-    index = np.arange(count)
-    if "indices" in primitive:
-        index = _values(document, blob, primitive["indices"]).astype(np.int64).ravel()
-        if index.size and index.max() >= count:
-            raise ValueError("its faces name vertices that it does not have")
-    mode, each = primitive.get("mode", 4), np.arange(len(index) - 2)
-    if mode == 4:
-        return index[: len(index) // 3 * 3].reshape(-1, 3)
-    if mode == 5:
-        return index[np.stack([each, each + 1 + each % 2, each + 2 - each % 2], axis=1)]
-    return index[np.stack([each + 1, each + 2, np.zeros_like(each)], axis=1)] if mode == 6 else None
+    def content(self, uri: str) -> bytes:
+        """What an address in the document says, or names in its folder; nothing where that is not there."""
+        if uri.startswith("data:"):
+            return b64decode(uri.partition(",")[2])
+        file = _beside(self.folder, unquote(uri))
+        return file.read_bytes() if file.is_file() else b""
 
+    def parts(self, node: int, outer: Array) -> list[Mesh]:
+        """The triangles below a node, in the frame that `outer` (4, 4) leads to."""
+        from scipy.spatial.transform import Rotation
 
-def _instances(document: dict[str, Any], blob: bytes, node: dict[str, Any]) -> Array:
-    """(N, 4, 4) where copies of a node's mesh stand in it, by EXT_mesh_gpu_instancing."""
-    from scipy.spatial.transform import Rotation
+        about = self.document["nodes"][node]
+        if "matrix" in about:
+            own = np.array(about["matrix"], np.float64).reshape(4, 4).T
+        else:
+            own = np.eye(4)
+            turn = Rotation.from_quat(about.get("rotation", [0, 0, 0, 1])).as_matrix()
+            own[:3, :3] = turn * np.array(about.get("scale", [1, 1, 1]))
+            own[:3, 3] = about.get("translation", [0, 0, 0])
+        pose, found = outer @ own, list[Mesh]()
+        for primitive in self.document["meshes"][about["mesh"]]["primitives"] if "mesh" in about else []:
+            faces = self.faces(primitive)
+            if faces is None:
+                print("note: lines and points of the glTF are left out; triangles are read", flush=True)
+                continue
+            names, number = primitive["attributes"], primitive.get("material", -1)
+            vertices = self.values(names["POSITION"])
+            colors = 255 * self.values(names["COLOR_0"])[:, :3] if "COLOR_0" in names else None
+            uvs = None
+            if number >= 0 and (place := f"TEXCOORD_{self.texture(number).get('texCoord', 0)}") in names:
+                uvs = self.values(names[place])[faces]
+            for instance in self.instances(about):
+                turn = pose @ instance
+                corners = faces if np.linalg.det(turn[:3, :3]) > 0 else faces[:, ::-1]
+                own_uvs = uvs if uvs is None or corners is faces else uvs[:, ::-1]
+                moved = vertices @ turn[:3, :3].T + turn[:3, 3]
+                found.append(Mesh(moved, corners, colors, own_uvs, np.full(len(faces), number)))
+        return found + [part for child in about.get("children", []) for part in self.parts(child, pose)]
 
-    names = node.get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes", {})
-    values = {name: _values(document, blob, names[name]) for name in INSTANCE_PARTS if name in names}
-    poses = np.tile(np.eye(4), (len(next(iter(values.values()), [0])), 1, 1))
-    if "ROTATION" in values:
-        poses[:, :3, :3] = Rotation.from_quat(values["ROTATION"]).as_matrix()
-    if "SCALE" in values:
-        poses[:, :3, :3] *= values["SCALE"][:, None]
-    if "TRANSLATION" in values:
-        poses[:, :3, 3] = values["TRANSLATION"]
-    return poses
+    def faces(self, primitive: dict[str, Any]) -> NDArray[np.int64] | None:
+        """The triangles (F, 3) of triangles, a strip or a fan (glTF 2.0, 3.7.2.1); None of lines and points."""
+        count = self.document["accessors"][primitive["attributes"]["POSITION"]]["count"]
+        index = np.arange(count)
+        if "indices" in primitive:
+            index = self.values(primitive["indices"]).astype(np.int64).ravel()
+            if index.size and index.max() >= count:
+                raise ValueError("its faces name vertices that it does not have")
+        mode, each = primitive.get("mode", 4), np.arange(len(index) - 2)
+        if mode == 4:
+            return index[: len(index) // 3 * 3].reshape(-1, 3)
+        if mode == 5:
+            return of_strip(index)
+        return index[np.stack([each + 1, each + 2, np.zeros_like(each)], axis=1)] if mode == 6 else None
 
+    def instances(self, node: dict[str, Any]) -> Array:
+        """(N, 4, 4) where copies of a node's mesh stand in it, by EXT_mesh_gpu_instancing."""
+        from scipy.spatial.transform import Rotation
 
-def _values(document: dict[str, Any], blob: bytes, accessor: int) -> Array:
-    """(N, K) values of an accessor of glTF; normalised integers as fractions."""
-    about = document["accessors"][accessor]
-    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[about["type"]]
-    kind, count = _kind(about), about["count"]
-    if "bufferView" in about:
-        table = _stored(document, blob, about, kind, count, width).astype(np.float64)
-    elif count > 256 * AT_ONCE:
-        raise ValueError("it counts more values than a file holds")
-    else:
-        table = np.zeros((count, width))
-    if "sparse" in about:
-        sparse = about["sparse"]
-        rows = _stored(document, blob, sparse["indices"], _kind(sparse["indices"]), sparse["count"], 1)[:, 0]
-        table[rows] = _stored(document, blob, sparse["values"], kind, sparse["count"], width)
-    return np.maximum(table / np.iinfo(kind).max, -1) if about.get("normalized") else table
+        names = node.get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes", {})
+        values = {name: self.values(names[name]) for name in INSTANCE_PARTS if name in names}
+        poses = np.tile(np.eye(4), (len(next(iter(values.values()), [0])), 1, 1))
+        if "ROTATION" in values:
+            poses[:, :3, :3] = Rotation.from_quat(values["ROTATION"]).as_matrix()
+        if "SCALE" in values:
+            poses[:, :3, :3] *= values["SCALE"][:, None]
+        if "TRANSLATION" in values:
+            poses[:, :3, 3] = values["TRANSLATION"]
+        return poses
+
+    def values(self, accessor: int) -> Array:
+        """(N, K) values of an accessor; normalised integers as fractions."""
+        about = self.document["accessors"][accessor]
+        width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[about["type"]]
+        kind, count = _kind(about), about["count"]
+        if "bufferView" in about:
+            table = self.stored(about, kind, count, width).astype(np.float64)
+        elif count > 256 * AT_ONCE:
+            raise ValueError("it counts more values than a file holds")
+        else:
+            table = np.zeros((count, width))
+        if "sparse" in about:
+            sparse = about["sparse"]
+            rows = self.stored(sparse["indices"], _kind(sparse["indices"]), sparse["count"], 1)[:, 0]
+            table[rows] = self.stored(sparse["values"], kind, sparse["count"], width)
+        return np.maximum(table / np.iinfo(kind).max, -1) if about.get("normalized") else table
+
+    def stored(self, about: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> NDArray[Any]:
+        """(N, K) numbers that lie in a buffer."""
+        view = self.document["bufferViews"][about["bufferView"]]
+        start = view.get("byteOffset", 0) + about.get("byteOffset", 0)
+        step = view.get("byteStride", kind.itemsize * width)
+        return np.ndarray((count, width), kind, self.buffers[view["buffer"]], start, (step, kind.itemsize))
+
+    def painted(self, material: int) -> tuple[dict[str, Any], list[float]]:
+        """What a material says of its texture, and its colour: by its base colour, as a diffuse one (older exports),
+        or, of one that shines and has no texture else, by its light."""
+        about = self.document["materials"][material]
+        base, old = about.get("pbrMetallicRoughness", {}), about.get("extensions", {}).get(DIFFUSE)
+        if old is not None:
+            return old.get("diffuseTexture", {}), old.get("diffuseFactor", [1, 1, 1])
+        if "emissiveTexture" in about and "baseColorTexture" not in base:
+            return about["emissiveTexture"], about.get("emissiveFactor", [1, 1, 1])
+        return base.get("baseColorTexture", {}), base.get("baseColorFactor", [1, 1, 1])
+
+    def texture(self, material: int) -> dict[str, Any]:
+        """What a material says of its texture: `index`, and `texCoord`, `offset`, `scale`, `rotation` of its places."""
+        about = self.painted(material)[0]
+        return about | about.get("extensions", {}).get("KHR_texture_transform", {})
+
+    def material(self, number: int) -> Material:
+        """A material's colour and picture."""
+        color = tuple(255 * part for part in self.painted(number)[1][:3])
+        texture = self.texture(number)
+        if "index" not in texture:
+            return Material(None, color)
+        sources = self.document["textures"][texture["index"]]
+        source = sources.get("extensions", {}).get("EXT_texture_webp", sources).get("source")
+        image = {} if source is None else self.document["images"][source]
+        if "bufferView" in image:
+            view = self.document["bufferViews"][image["bufferView"]]
+            start = view.get("byteOffset", 0)
+            encoded = self.buffers[view["buffer"]][start : start + view["byteLength"]]
+        else:
+            encoded = self.content(image["uri"]) if "uri" in image else b""
+        picture = _picture(encoded, image.get("name", f"number {source}"))
+        cos, sin = np.cos(texture.get("rotation", 0.0)), np.sin(texture.get("rotation", 0.0))
+        place = np.eye(3)
+        place[:2, :2] = np.array([[cos, -sin], [sin, cos]]) * texture.get("scale", [1, 1])
+        place[:2, 2] = texture.get("offset", [0, 0])
+        down = np.array([[1.0, 0, 0], [0, -1.0, 1], [0, 0, 1]])  # glTF counts from the upper edge
+        return Material(picture, color, (down @ place)[:2])
 
 
 def _kind(about: dict[str, Any]) -> np.dtype[Any]:
     """The type of an accessor's numbers (glTF 2.0, 3.6.2.2)."""
     kinds = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
     return np.dtype(kinds[about["componentType"]])
-
-
-def _stored(
-    document: dict[str, Any], blob: bytes, about: dict[str, Any], kind: np.dtype[Any], count: int, width: int
-) -> NDArray[Any]:
-    """(N, K) numbers that lie in the blob."""
-    view = document["bufferViews"][about["bufferView"]]
-    start, step = view.get("byteOffset", 0) + about.get("byteOffset", 0), view.get("byteStride", kind.itemsize * width)
-    return np.ndarray((count, width), kind, blob, start, (step, kind.itemsize))
-
-
-def _painted(document: dict[str, Any], material: int) -> tuple[dict[str, Any], list[float]]:
-    """What a material says of its texture, and its colour: by its base colour, as a diffuse one (older exports), or, of
-    one that shines and has no texture else, by its light."""
-    about = document["materials"][material]
-    base, old = about.get("pbrMetallicRoughness", {}), about.get("extensions", {}).get(DIFFUSE)
-    if old is not None:
-        return old.get("diffuseTexture", {}), old.get("diffuseFactor", [1, 1, 1])
-    if "emissiveTexture" in about and "baseColorTexture" not in base:
-        return about["emissiveTexture"], about.get("emissiveFactor", [1, 1, 1])
-    return base.get("baseColorTexture", {}), base.get("baseColorFactor", [1, 1, 1])
-
-
-def _texture(document: dict[str, Any], material: int) -> dict[str, Any]:
-    """What a material says of its texture: `index`, and `texCoord`, `offset`, `scale`, `rotation` of its places."""
-    about = _painted(document, material)[0]
-    return about | about.get("extensions", {}).get("KHR_texture_transform", {})
-
-
-def _gltf_material(document: dict[str, Any], blob: bytes, number: int) -> Material:
-    color = tuple(255 * part for part in _painted(document, number)[1][:3])
-    texture = _texture(document, number)
-    if "index" not in texture:
-        return Material(None, color)
-    sources = document["textures"][texture["index"]]
-    source = sources.get("extensions", {}).get("EXT_texture_webp", sources).get("source")
-    image = {} if source is None else document["images"][source]
-    view = document["bufferViews"][image["bufferView"]] if "bufferView" in image else {"byteLength": 0}
-    start, uri = view.get("byteOffset", 0), image.get("uri", "")
-    content = b64decode(uri.partition(",")[2]) if uri.startswith("data:") else blob[start : start + view["byteLength"]]
-    picture = _picture(content, image.get("name", f"number {source}"))
-    cos, sin = np.cos(texture.get("rotation", 0.0)), np.sin(texture.get("rotation", 0.0))
-    place = np.eye(3)
-    place[:2, :2] = np.array([[cos, -sin], [sin, cos]]) * texture.get("scale", [1, 1])
-    place[:2, 2] = texture.get("offset", [0, 0])
-    down = np.array([[1.0, 0, 0], [0, -1.0, 1], [0, 0, 1]])  # glTF counts from the upper edge
-    return Material(picture, color, (down @ place)[:2])

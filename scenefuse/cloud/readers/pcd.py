@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import COLOR, Columns, next_rows, typed
+from scenefuse.cloud.readers.columns import Columns, check_count, next_rows, rows_behind, typed
 from scenefuse.core.stage import StageError
 
 
@@ -53,8 +53,7 @@ def read_pcd(path: Path, at_once: int) -> Iterator[Columns]:
     for arrays in read(path, header, at_once):
         count += len(arrays[0])
         yield _columns(header, arrays)
-    if count < header.count:
-        raise StageError(f"{path} is cut short: its last {header.count - count} points are missing; copy it again")
+    check_count(path, header.count, count)
 
 
 def _header(path: Path) -> _Header:
@@ -77,9 +76,9 @@ def _header(path: Path) -> _Header:
     size = sum(kind.itemsize * n for kind, n in zip(types, repeats))
     if len({len(names), len(repeats), len(types)}) > 1 or count < 0 or size <= 0 or min(repeats) < 0:
         raise ValueError("its header does not say what its rows hold")
-    missing = count - (path.stat().st_size - begin) // size
-    if data == "binary" and missing > 0:
-        raise StageError(f"{path} is cut short: its last {missing} points are missing; copy it again")
+    there, odd = divmod(path.stat().st_size - begin, size)
+    if data == "binary" and (there < count or not odd):
+        check_count(path, count, there)
     return _Header(names, types, repeats, count, data, begin, lines)
 
 
@@ -94,6 +93,7 @@ def _lines(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[A
                 return
             left -= len(rows)
             yield [typed(rows[:, at : at + n], kind) for at, n, kind in zip(ends, header.repeats, header.types)]
+        check_count(path, header.count, header.count + rows_behind(file, ends[-1]))
 
 
 def _rows(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
@@ -132,20 +132,8 @@ def _compressed(path: Path, header: _Header, at_once: int) -> Iterator[list[NDAr
 
 
 def _columns(header: _Header, arrays: list[NDArray[Any]]) -> Columns:
-    """Fields of one number by their names, packed colours as three; padding is left out."""
-    columns = {
-        name: array[:, 0] for name, array, n in zip(header.names, arrays, header.repeats) if n == 1 and name != "_"
-    }
-    for name in {"rgb", "rgba"} & set(columns):
-        kind = header.types[header.names.index(name)]
-        packed = columns.pop(name)
-        if header.data == "ascii" and kind.kind == "f":
-            packed = np.nan_to_num(packed)
-            if 1 <= np.abs(packed).max(initial=0) < 2**32:  # the integer itself, not the real number of its bits
-                packed, kind = packed.astype(np.int64), np.dtype(np.uint32)
-        bits = np.ascontiguousarray(packed.astype(kind)).view(np.uint32)
-        columns |= {color: (bits >> shift & 255).astype(np.uint8) for color, shift in zip(COLOR, (16, 8, 0))}
-    return columns
+    """Fields of one number by their names; padding is left out."""
+    return {name: array[:, 0] for name, array, n in zip(header.names, arrays, header.repeats) if n == 1 and name != "_"}
 
 
 def _lzf(packed: bytes, size: int) -> bytearray:

@@ -14,13 +14,15 @@ from scenefuse.cloud.readers.columns import (
     POSITION,
     Columns,
     bytes_of,
+    check_count,
     colors_of,
-    common_names,
+    named,
     next_rows,
     positions,
+    rows_behind,
     typed,
 )
-from scenefuse.cloud.readers.meshes import Array, Material, Mesh, picture_beside, sampled_columns, triangles
+from scenefuse.cloud.readers.meshes import Array, Material, Mesh, of_strip, picture_beside, sampled_columns, triangles
 from scenefuse.core.stage import StageError
 
 KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -32,6 +34,8 @@ TYPES = {name: kind for kind, name in NAMES.items()} | dict(
 
 # What fields are called by in a file: CloudCompare reads these without being told to.
 FIELD = "scalar_"
+# Elements whose rows are polygons, or strips of triangles one after the other with -1 between them.
+FACES, STRIPS = "face", "tristrips"
 # What the list of a face's corners is called, and that of their places in a texture; those of vertices.
 CORNERS, PLACES = ("vertex_indices", "vertex_index"), "texcoord"
 PLACE_NAMES = (("texture_u", "texture_v"), ("s", "t"), ("u", "v"))
@@ -82,7 +86,7 @@ def _header(path: Path) -> tuple[list[Element], int, bool]:
 def in_rows(path: Path) -> bool:
     """Whether the points of a PLY come first, without lists, and are no corners of faces."""
     elements = _header(path)[0]
-    mesh = any(element.name == "face" and element.count for element in elements)
+    mesh = any(element.name in (FACES, STRIPS) and element.count for element in elements)
     return bool(elements) and elements[0].name == "vertex" and elements[0].row is not None and not mesh
 
 
@@ -100,11 +104,13 @@ def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
     if not is_text:
         check_size(path, elements, offset)
     if in_rows(path):
-        yield from _rows(path, elements[0], offset, is_text, at_once)
+        yield from _rows(path, elements, offset, is_text, at_once)
         return
-    vertex, face = _mesh_of_text(path, elements, offset) if is_text else _mesh_of_bytes(path)
-    vertex = dict(zip(common_names(list(vertex)), vertex.values()))
+    tables = _tables_of_text(path, elements, offset) if is_text else _tables_of_bytes(path)
+    vertex, face = named(_numbers(tables.get("vertex", {}))), tables.get(FACES, {})
     faces: Any = next((face[name] for name in CORNERS if name in face), [])
+    if strips := [strip for name in CORNERS for strip in tables.get(STRIPS, {}).get(name, [])]:
+        face, faces = {}, np.concatenate([of_strip(np.asarray(strip).astype(np.int64)) for strip in strips])
     if not len(faces) or not set(POSITION) <= set(vertex):
         yield vertex
         return
@@ -137,49 +143,47 @@ def check_size(path: Path, elements: list[Element], offset: int, advice: str = "
         size = len(element.kinds) if element.row is None else element.row.itemsize
         there -= size * element.count
         if there < 0:
-            raise _cut_short(path, element.name, min(-(there // size), element.count), advice)
+            check_count(path, element.count, max(element.count + there // size, 0), _rows_of(element), advice)
+    if there and all(element.row is not None for element in elements) and there % size == 0:
+        check_count(path, element.count, element.count + there // size, _rows_of(element))
 
 
-def _cut_short(path: Path, element: str, missing: int, advice: str = "copy it again") -> StageError:
-    what = "points" if element == "vertex" else f"rows of {element}"
-    return StageError(f"{path} is cut short: its last {missing} {what} are missing; {advice}")
+def _rows_of(element: Element) -> str:
+    """What the rows of an element are called."""
+    return "points" if element.name == "vertex" else f"rows of {element.name}"
 
 
-def _mesh_of_bytes(path: Path) -> tuple[Columns, dict[str, Any]]:
-    """The columns of the vertices, and the properties of the faces by their names."""
+def _numbers(table: dict[str, Any]) -> Columns:
+    """The columns of a table that hold a number a row."""
+    return {name: v for name, v in table.items() if isinstance(v, np.ndarray) and v.dtype.kind in "iuf"}
+
+
+def _tables_of_bytes(path: Path) -> dict[str, dict[str, Any]]:
+    """The properties of each element by their names."""
     from plyfile import PlyData
 
-    content = PlyData.read(path)
-    vertex = content["vertex"].data
-    names = [name for name in vertex.dtype.names if vertex.dtype[name].kind in "iuf"]
-    columns = {name.removeprefix(FIELD): vertex[name].astype(vertex.dtype[name].newbyteorder("=")) for name in names}
-    face = content["face"].data if "face" in content else np.empty(0, [("", "u1")])
-    return columns, {name: face[name] for name in face.dtype.names or ()}
+    tables = {element.name: element.data for element in PlyData.read(path)}
+    return {
+        own: {n.removeprefix(FIELD): rows[n].astype(rows[n].dtype.newbyteorder("=")) for n in rows.dtype.names or ()}
+        for own, rows in tables.items()
+    }
 
 
-def _mesh_of_text(path: Path, elements: list[Element], offset: int) -> tuple[Columns, dict[str, Any]]:
+def _tables_of_text(path: Path, elements: list[Element], offset: int) -> dict[str, dict[str, Any]]:
     """The same of a file of text."""
-    vertex: Columns = {}
-    faces: dict[str, Any] = {}
+    tables: dict[str, dict[str, Any]] = {}
     with open(path, "rb") as file:
         file.seek(offset)
         for element in elements:
             if element.row is not None:
-                columns = _columns_of_text(path, file, element, element.count)[0]
-                there = len(next(iter(columns.values()), ()))
-                if there < element.count:
-                    raise _cut_short(path, element.name, element.count - there)
-                vertex = columns if element.name == "vertex" else vertex
-                continue
-            rows = list(islice((line for line in file if line.strip()), element.count))
-            if len(rows) < element.count:
-                raise _cut_short(path, element.name, element.count - len(rows))
-            found = _with_lists(element, rows)
-            if element.name == "face":
-                faces = found
-            elif element.name == "vertex":
-                vertex = {name: values for name, values in found.items() if element.kinds[name] != "list"}
-    return vertex, faces
+                found: dict[str, Any] = _columns_of_text(path, file, element, element.count)[0]
+                there = len(next(iter(found.values()), ()))
+            else:
+                rows = list(islice((line for line in file if line.strip()), element.count))
+                there, found = len(rows), _with_lists(element, rows)
+            check_count(path, element.count, there, _rows_of(element))
+            tables[element.name] = found
+    return tables
 
 
 def _with_lists(element: Element, rows: list[bytes]) -> dict[str, Any]:
@@ -201,8 +205,9 @@ def _cells(element: Element, cells: list[bytes]) -> Iterator[Array]:
         at = end
 
 
-def _rows(path: Path, element: Element, offset: int, is_text: bool, at_once: int) -> Iterator[Columns]:
+def _rows(path: Path, elements: list[Element], offset: int, is_text: bool, at_once: int) -> Iterator[Columns]:
     """The columns of a PLY whose points come first, without lists, so many rows at a time."""
+    element, *others = elements
     left, row = element.count, element.row
     assert row is not None and row.names is not None
     with open(path, "rb") as file:
@@ -216,9 +221,11 @@ def _rows(path: Path, element: Element, offset: int, is_text: bool, at_once: int
                 columns = {name: rows[name].astype(row[name].newbyteorder("=")) for name in row.names}
             count = len(next(iter(columns.values()), ()))
             if not count:
-                raise _cut_short(path, element.name, left)
+                check_count(path, element.count, element.count - left)
             left -= count
             yield columns
+        if is_text and not others:
+            check_count(path, element.count, element.count + rows_behind(file, len(row.names)))
 
 
 def _columns_of_text(path: Path, file: BinaryIO, element: Element, most: int, line: int = 1) -> tuple[Columns, int]:

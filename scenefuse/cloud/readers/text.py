@@ -32,7 +32,11 @@ TEXTS = (".xyz", ".pts", ".txt", ".asc", ".csv")
 EASTING = ("x", "easting", "east", "e", "rechtswert", "rw", "ostwert")
 NORTHING = ("y", "northing", "north", "n", "hochwert", "hw", "nordwert")
 ELEVATION = ("z", "elevation", "elev", "height", "h", "altitude", "alt", "hoehe", "höhe")
+# Point, northing, easting, elevation and description, as surveyors' programs call a whole row.
+ROW_NAMES = re.compile("P?(NE|EN)ZD?", re.IGNORECASE)
 BESIDE = {"m", "utm", "coord", "coords", "coordinate"}
+# A unit behind a name.
+UNIT = re.compile(r"[\[(]\s*(\w+)\s*[\])]$")
 DEGREES = re.compile("lon|lat", re.IGNORECASE)
 # X is the easting in programs and the northing in German surveying.
 EAST_OR_NORTH = re.compile(r"[xy][\s_.-]*koord|koord\w*[\s_.-]*[xy]$", re.IGNORECASE)
@@ -106,6 +110,8 @@ def text_layout(path: Path) -> TextLayout:
     names = next((names for names in fitting if _axes(names)), [])
     if axes := _axes(names):
         usual = common_names(names)
+        if len(units := {unit[1].lower() for k in axes if (unit := UNIT.search(names[k]))}) > 1:
+            raise StageError(f"{path} has x, y and z in {', '.join(sorted(units))}; export all three in one unit")
         if not set(POSITION) <= set(usual):
             notes = [f"{path.name}: {', '.join(f'{axis} is {names[k]}' for axis, k in zip(POSITION, axes))}"]
         words = [name for name, numbers in zip(names, known) if name and not numbers]
@@ -124,7 +130,8 @@ def text_layout(path: Path) -> TextLayout:
                 " Rechtswert and Hochwert"
             )
         if first == 1:
-            notes.append(f"{path.name}: its first column names or numbers the points and is left out")
+            what = "names or numbers the points and is left out; the next three are x, y and z"
+            notes.append(f"{path.name}: its first column {what}")
         elif first:
             notes.append(f"{path.name}: its first two columns are rows and columns of a scan and are left out")
         if len(names) - rows.shape[1] + first in (0, 1):
@@ -196,7 +203,8 @@ def _headers(above: list[str], mark: str | None, width: int, unnumbered: int) ->
     for line in reversed(above):
         line = line.strip(" \r\n/#%")
         for own in dict.fromkeys((mark, separator(line))):
-            names = cells_of(line if own else re.sub(r"\s+[\[(][^\])]*[\])]", "", line), own)
+            whole = line if own else re.sub(r"\s+[\[(][^\])]*[\])]", "", line)
+            names = list(line) if ROW_NAMES.fullmatch(line) else cells_of(whole, own)
             while names and not names[-1]:
                 names.pop()
             names = names[:width] if own and own == mark and _axes(names[:width]) else names
