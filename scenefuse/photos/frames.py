@@ -21,6 +21,7 @@ from scenefuse.photos.photos import (
     photo_names,
     photo_notes,
     save_upright,
+    stays,
     without_copies,
     write_photos,
 )
@@ -117,7 +118,7 @@ def _from_folder(
 
     def copy(photo: Photo) -> Photo:
         target = output / frame_name(photo.name)
-        if photo.orientation == 1 and photo.width <= settings.max_width_px and not bits:
+        if photo.width <= settings.max_width_px and stays(source, photo, bits):
             shutil.copyfile(source / photo.name, target)
         else:
             photo = save_upright(source, photo, target, bits, settings.max_width_px)

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 JPEG = (".jpg", ".jpeg", ".jpe", ".jfif")
 SUFFIXES = (*JPEG, ".png", ".tif", ".tiff", ".bmp", ".ppm")
+# What COLMAP reads, whatever the ending, as Pillow calls it. The photos of many phones are MPO.
+FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "BMP", "PPM")
 VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts"}
 # Photos all the same, but in formats that not every stage can decode.
 UNREADABLE = frozenset(
@@ -286,11 +288,11 @@ def open_picture(path: Path) -> Iterator[Image]:
                 raise ValueError(f"{image.width} x {image.height} pixels are more than any camera takes")
             yield image
     except (*UNDECODABLE, Image.DecompressionBombError) as error:
-        why = (
-            "it is no picture, or of a format that is not read, whatever its ending"
-            if isinstance(error, Image.UnidentifiedImageError)
-            else str(error) or type(error).__name__
-        )
+        why = str(error) or type(error).__name__
+        if isinstance(error, Image.UnidentifiedImageError):
+            heic = head(path)[4:8] == b"ftyp"
+            why = "it is HEIC" if heic else "it is no picture, or of a format that is not read"
+            why += f", whatever its ending{': convert it to JPEG' if heic else ''}"
         raise StageError(f"{path} cannot be decoded ({why}); replace it, or remove it from its folder") from None
 
 

@@ -13,9 +13,9 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, value, write_json
-from scenefuse.photos.photo_files import JPEG, beside_photos, geo_file, in_folders, open_picture, photo_files
+from scenefuse.photos.photo_files import FORMATS, JPEG, beside_photos, geo_file, in_folders, open_picture, photo_files
 from scenefuse.photos.pictures import JPEG_QUALITY, read_raw, stretched
-from scenefuse.photos.positions import exif_number, exif_text, positions_of, read_geo, stated_position
+from scenefuse.photos.positions import check_order, exif_number, exif_text, positions_of, read_geo, stated_position
 
 # Photos and cameras differ in shape by no more than what rounding to whole pixels does.
 SHAPE_TOLERANCE = 0.01
@@ -75,8 +75,9 @@ class Photo:
 def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
     """List the photos of a folder and its subfolders, check that every one can be decoded, and stand them upright.
 
-    Photos that EXIF says are rotated are turned and written again; all others are linked, unless all are dark or use
-    few of their bits: then they are written brighter. From here on pixels count as people see them. A geo.txt in the
+    Photos that EXIF says are rotated are turned and written again, and so are those of a format that COLMAP does not
+    read, whatever their ending; all others are linked, unless all are dark or use few of their bits: then they are
+    written brighter. From here on pixels count as people see them. A geo.txt in the
     folder takes the place of the positions in EXIF.
 
     Args:
@@ -97,12 +98,13 @@ def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
     turned = {p.name: p.orientation for p in stored if p.orientation != 1}
     if geo:
         places = positions_of(names, positions, geo)
+        check_order(places, [asdict(photo) for photo in listed], geo)
         listed = [replace(p, position_note="", **place) for p, place in zip(listed, places)]
     notes = copies + below_folder(names) + photo_notes(listed, bits)
     if geo:
-        notes.append(
-            f"{geo.name} gives {sum(p.has_gps for p in listed)} of {len(listed)} positions; EXIF's are not used"
-        )
+        known = [photo for photo in listed if photo.has_gps]
+        where = f"{known[0].name} at latitude {known[0].latitude_deg:.5f}, longitude {known[0].longitude_deg:.5f}"
+        notes.append(f"{geo.name} gives {len(known)} of {len(listed)} positions ({where}); EXIF's are not used")
     if turned:
         first = next(iter(turned))
         notes.append(f"{len(turned)} photos ({first}, ...) carry an EXIF rotation; upright copies of them are used")
@@ -164,10 +166,16 @@ def _stood_upright(folder: Path, photo: Photo, output: Path, bits: int) -> Photo
     """Link or write one photo into `output`; what is listed is the result."""
     target = output / photo.name
     target.parent.mkdir(parents=True, exist_ok=True)
-    if photo.orientation == 1 and not bits:
+    if stays(folder, photo, bits):
         target.symlink_to(os.path.relpath(os.path.realpath(folder / photo.name), os.path.realpath(target.parent)))
         return photo
     return save_upright(folder, photo, target, bits)
+
+
+def stays(folder: Path, photo: Photo, bits: int) -> bool:
+    """Whether a photo's file is used as it is: upright, not to be made brighter, and in a format that COLMAP reads."""
+    with open_picture(folder / photo.name) as image:
+        return photo.orientation == 1 and not bits and image.format in FORMATS
 
 
 def save_upright(folder: Path, photo: Photo, target: Path, bits: int = 0, max_width_px: int | None = None) -> Photo:

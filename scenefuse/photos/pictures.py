@@ -41,16 +41,30 @@ def matte_of(picture: NDArray[Any]) -> NDArray[np.bool_]:
     """A mask picture as (H, W) bool: alpha where it varies, else brightness, above half of the largest value.
 
     Raises:
-        StageError: most of it is grey, as of a photo.
+        StageError: most of it is grey, as of a photo, or it has areas of several values or colours, as of labels.
     """
     if picture.ndim == 3 and picture.shape[2] == 4 and picture[..., 3].min() < picture[..., 3].max():
-        channel = picture[..., 3]
-    else:
-        channel = picture[..., :3].max(2) if picture.ndim == 3 else picture
+        picture = picture[..., 3]
+    elif picture.ndim == 3:
+        picture = picture[..., :3]
+    channel = picture.max(2) if picture.ndim == 3 else picture
     top = max(1, channel.max())
+    if (areas := _even_areas(picture, top)) > 2:
+        raise StageError(f"it has areas of {areas} values, as labels of several things have: give the object's alone")
     if np.median(np.abs(channel[::4, ::4] / top - 0.5)) < 0.4:
         raise StageError("it is no mask: most of it is grey")
     return np.asarray(channel > top / 2)
+
+
+def _even_areas(picture: NDArray[Any], top: int) -> int:
+    """How many values or colours, told apart in fifteenths of the largest, fill areas: a 500th of a picture or more.
+
+    Soft edges, and the noise of JPEG, are no areas: their neighbouring pixels differ."""
+    planes = np.atleast_3d(picture)
+    corner = planes[:-1, :-1]
+    even = ((corner == planes[1:, :-1]) & (corner == planes[:-1, 1:]) & (corner == planes[1:, 1:])).all(2)
+    steps = np.rint(corner[even] / top * 15).astype(np.int64) @ 16 ** np.arange(planes.shape[2])
+    return int(np.count_nonzero(500 * np.bincount(steps) >= even.size))
 
 
 def stretched(pixels: NDArray[Any], bits: int) -> NDArray[np.uint8]:

@@ -223,6 +223,20 @@ def positions_of(names: list[str], positions: dict[str, Position], path: Path) -
     return [asdict(positions[found[name]] if name in found else Position()) for name in names]
 
 
+def check_order(given: list[dict[str, Any]], stated: list[dict[str, Any]], path: Path) -> None:
+    """StageError where positions of photos that a file gives lie nearer to those of EXIF with latitude and longitude
+    swapped: both are the fields of a `Position`, photo by photo."""
+    names = ("latitude_deg", "longitude_deg")
+    both = [[[one[name] for name in names] for one in pair] for pair in zip(given, stated)]
+    table: Array = np.array([pair for pair in both if None not in [*pair[0], *pair[1]]]).reshape(-1, 2, 2)
+    off, swapped = (np.abs(table[:, 0, order] - table[:, 1]).max(1) for order in ([0, 1], [1, 0]))
+    if len(table) and 10 * np.median(swapped) < np.median(off):
+        raise StageError(
+            f"{path} gives latitude before longitude, as the positions in the photos' EXIF show; write the longitude"
+            " (x) first"
+        )
+
+
 def _position(place: Array, sd: Array) -> Position:
     horizontal, vertical = (float(s) if np.isfinite(s) and s > 0 else None for s in sd)
     altitude = float(place[2]) if np.isfinite(place[2]) else None

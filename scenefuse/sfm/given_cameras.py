@@ -342,8 +342,10 @@ def read_mask(file: Path, size: tuple[int, ...]) -> NDArray[np.bool_]:
     """
     try:
         mask = matte_of(read_raw(file))
-    except StageError:
-        raise StageError(f"the mask {file} cannot be read; export it again as PNG") from None
+    except StageError as error:
+        raise StageError(
+            f"the mask {file} cannot be read ({str(error).split(';')[0]}); export it again as PNG"
+        ) from None
     (height, width), (photo_width, photo_height) = mask.shape, size
     if abs(width * photo_height / (height * photo_width) - 1) > SHAPE_TOLERANCE:
         raise StageError(

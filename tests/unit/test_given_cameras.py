@@ -280,6 +280,13 @@ def test_wrong_cameras_are_named(tmp_path):
         ("cameras.json", '[{"id": 0, "img_name": "a"}]', "a list of Gaussian splatting; give the model of COLMAP"),
         ("images.txt", "# Image list", "part of COLMAP's project; give the folder"),
         ("database.db", "SQLite format 3\0", "part of COLMAP's project; give the folder"),
+        ("poses.csv", "#name,x,y,alt,heading,pitch,roll\n", "RealityCapture's; in RealityCapture, export"),
+        ("IMG_1.xmp", '<x:xmpmeta><rdf:RDF><rdf:Description xcr:Version="3"', "RealityCapture's; in RealityCapture"),
+        (
+            "cams.txt",
+            "# Cameras (2)\n# PhotoID, X, Y, Z, Omega, Phi, Kappa\n",
+            "a list of poses without lenses; export",
+        ),
         (
             "cameras.json",
             '{"v2 dji": {"projection_type": "brown"}}',
@@ -292,6 +299,10 @@ def test_cameras_in_no_format_that_is_read_are_named_with_what_is_read(tmp_path,
     (tmp_path / name).write_text(text)
     with pytest.raises(StageError, match=f"{name} .*{sentence}"):
         read_posed_photos(tmp_path / name, tmp_path)
+    # So they are in a folder, among files of no program.
+    (tmp_path / "notes.txt").write_text("windy")
+    with pytest.raises(StageError, match="cameras.txt" if name == "images.txt" else sentence):
+        read_posed_photos(tmp_path, tmp_path)
 
 
 @pytest.mark.parametrize("upper", [False, True])

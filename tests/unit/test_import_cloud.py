@@ -319,4 +319,6 @@ def test_what_was_guessed_of_a_text_s_columns_is_in_the_report(tmp_path):
     points = np.random.default_rng(0).uniform(0, 9, (300, 3)).round(3)
     np.savetxt(tmp_path / "a.txt", np.column_stack([np.arange(300), points]), fmt="%.3f")
     _, report, _ = imported_scene(tmp_path, tmp_path / "a.txt")
-    assert value(report, "notes") == ["a.txt: its first column names or numbers the points and is left out; the next three are x, y and z"]
+    assert value(report, "notes") == [
+        "a.txt: its first column names or numbers the points and is left out; the next three are x, y and z"
+    ]

@@ -23,6 +23,8 @@ from scenefuse.nerf.rendered_maps import RenderedMapSettings, measure_quality
 from scenefuse.nerf.train_nerf import TrainingOptions, nerf_settings, train_nerf
 from scenefuse.nerf.training import NerfRecipe
 from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
+from scenefuse.photos.cameras.read_cameras import read_posed_photos
+from scenefuse.photos.pictures import matte_of, read_raw
 from scenefuse.photos.views import load_views
 from scenefuse.sfm.given_cameras import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
@@ -287,7 +289,7 @@ def shrink(file, size):
         (lambda root: (root / "masks/02.png").unlink(), r"frame 2 .*its mask masks/02.png does not exist"),
         (
             lambda root: (root / "masks/02.png").write_text("no picture"),
-            "masks/02.png cannot be read; export",
+            r"masks/02.png cannot be read \(.*\); export",
         ),
         (edit(camera_model="THIN_PRISM_FISHEYE"), "camera model THIN_PRISM_FISHEYE is not read; undistort"),
         (edit(camera_model="OPENCV_FISHEYE", fl_x=None, camera_angle_x=1.0), "no focal length; give fl_x"),
@@ -318,8 +320,37 @@ def test_a_photo_is_no_mask(tmp_path):
     data = nerfstudio(tmp_path / "in")
     grey = np.random.default_rng(0).integers(60, 200, (64, 96, 3)).astype(np.uint8)
     cv2.imwrite(str(data / "masks/02.png"), grey)
-    with pytest.raises(StageError, match="masks/02.png cannot be read"):
+    with pytest.raises(StageError, match=r"masks/02.png cannot be read \(it is no mask: most of it is grey\); export"):
         imported(data, tmp_path)
+
+
+@pytest.mark.parametrize("values", [(1, 2, 3), (60, 120, 200), ((255, 0, 0), (0, 255, 0), (0, 0, 255))])
+def test_labels_of_several_things_are_no_mask(tmp_path, values):
+    data = nerfstudio(tmp_path / "in")
+    labels = np.zeros((64, 96, *np.shape(values)[1:]), np.uint8)
+    for k, value_ in enumerate(values):
+        labels[10 + 15 * k : 20 + 15 * k, 30:50] = value_
+    cv2.imwrite(str(data / "masks/02.png"), labels)
+    with pytest.raises(StageError, match=r"02.png cannot be read \(it has areas of 4 values, as labels of several"):
+        imported(data, tmp_path)
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg"])
+def test_a_mask_with_a_soft_edge_or_of_one_label_is_one(tmp_path, ending):
+    disc = np.hypot(*np.mgrid[-200:200, -300:300]) < 100
+    soft = cv2.GaussianBlur(255 * disc.astype(np.uint8), (0, 0), 8)
+    for mask in (soft, disc.astype(np.uint8), np.dstack([np.zeros_like(soft), np.zeros_like(soft), 200 * disc])):
+        cv2.imwrite(str(tmp_path / f"a.{ending}"), mask)
+        if ending == "png" or mask.max() > 1:
+            assert np.mean(matte_of(read_raw(tmp_path / f"a.{ending}")) != disc) < 0.01
+
+
+def test_the_angles_of_view_give_focal_lengths_across_and_upwards(tmp_path):
+    angles = {f"camera_angle_{axis}": 2 * np.arctan(side / 2 / focal) for axis, side, focal in
+              (("x", WIDTH, LENS[0, 0]), ("y", HEIGHT, 1.3 * LENS[1, 1]))}  # fmt: skip
+    data = nerfstudio(tmp_path / "in", fl_x=None, fl_y=None, **angles)
+    photos, _, _ = read_posed_photos(data, None)
+    assert photos[0].camera.params[:2].tolist() == pytest.approx([LENS[0, 0], 1.3 * LENS[1, 1]])
 
 
 def test_no_masks_says_what_to_give(tmp_path):

@@ -150,7 +150,7 @@ def test_a_glb_stands_upright_at_its_place(tmp_path):
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "not a readable OBJ cloud .*vertices that it does not have"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "none of its faces has an area"),
         ("a.obj", "", r"is empty \(0 bytes\)"),
-        ("a.glb", "solid", "not a readable GLB cloud .*does not begin as GLB does"),
+        ("a.glb", "solid", "not a readable GLB cloud .*does not begin as glTF does"),
         ("a.fbx", "x", r"'\.fbx' is no known ending of a cloud or mesh; convert it to one of \.ply, \.obj, \.glb"),
     ],
     ids=["no such vertex", "no area", "empty", "no GLB", "unknown ending"],

@@ -241,6 +241,30 @@ def test_photos_that_cannot_be_read_are_named(tmp_path, name):
         photo_files(tmp_path / "p")
 
 
+@pytest.mark.parametrize("form", ["WEBP", "GIF", "AVIF", "MPO"])
+def test_photos_that_are_not_what_their_ending_says_are_read_by_colmap(tmp_path, form):
+    (tmp_path / "p").mkdir()
+    for name, blue in (("a.jpg", 50), ("b.png", 60)):
+        Image.new("RGB", (40, 30), (200, 100, blue)).save(tmp_path / "p" / name, form)
+    list_photos(folder=tmp_path / "p", upright=tmp_path / "up", photos=tmp_path / "photos.json")
+    for name, blue in (("a.jpg", 50), ("b.png", 60)):
+        pixels = pycolmap.Bitmap.read(tmp_path / "up" / name, True).to_array()
+        assert np.abs(pixels[5, 5].astype(int) - [200, 100, blue]).max() <= 12
+        assert (tmp_path / "up" / name).is_symlink() == (form == "MPO")
+
+
+def test_heic_by_another_name_is_named(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(99))
+    with pytest.raises(StageError, match=r"a.jpg cannot be decoded \(it is HEIC, whatever its ending: convert it"):
+        inspect_photo(tmp_path, "a.jpg")
+
+
+def test_a_jpeg_of_a_phone_that_holds_a_second_picture_is_read(tmp_path):
+    picture = Image.new("RGB", (40, 30))
+    picture.save(tmp_path / "a.jpg", "MPO", save_all=True, append_images=[picture.resize((20, 15))])
+    assert inspect_photo(tmp_path, "a.jpg").width == 40
+
+
 R = TiffImagePlugin.IFDRational
 NONE = R(0, 0)
 

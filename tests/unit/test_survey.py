@@ -386,6 +386,27 @@ def test_a_bad_geo_file_is_named(tmp_path, text, words):
         listed(tmp_path / "flight", tmp_path)
 
 
+@pytest.mark.parametrize("swapped", [True, False])
+def test_latitude_before_longitude_shows_beside_exif(tmp_path, capsys, swapped):
+    folder = tmp_path / "flight"
+    rows = []
+    for k in range(3):
+        place = [8.5 + 1e-4 * k, 47.4]
+        picture, exif = Image.new("RGB", (8, 6)), Image.Exif()
+        exif[IFD.GPSInfo] = {1: "N", 2: (47.4, 0.0, 0.0), 3: "E", 4: (8.5002, 0.0, 0.0)}
+        folder.mkdir(exist_ok=True)
+        picture.putpixel((k, 0), (255, 0, 0))
+        picture.save(folder / f"{k}.jpg", exif=exif)
+        rows.append(" ".join(map(str, [f"{k}.jpg", *(place[::-1] if swapped else place)])))
+    (folder / "geo.txt").write_text("\n".join(["EPSG:4326", *rows]))
+    if swapped:
+        with pytest.raises(StageError, match="geo.txt gives latitude before longitude, as the positions in"):
+            listed(folder, tmp_path)
+    else:
+        assert listed(folder, tmp_path)["0.jpg"].longitude_deg == 8.5
+        assert "(0.jpg at latitude 47.40000, longitude 8.50000)" in capsys.readouterr().out
+
+
 BARS = {
     name: (first, second, round(float(np.linalg.norm(first - second)), 4))
     for name, first, second in zip(("door", "kerb", "path"), PLACES[[0, 2, 4]], PLACES[[1, 3, 6]])

@@ -24,7 +24,7 @@ PLACES = (FILE, f"opensfm/{FILE}")
 # What an OpenDroneMap project that lies on the earth has beside it.
 TOPOCENTRIC = "reconstruction.topocentric.json"
 # What describes a camera, of a frame or of all of them.
-NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "k4", "p1", "p2")
+NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "k4", "p1", "p2")
 FISHEYE = "OPENCV_FISHEYE"
 # OpenSfM's lenses -> whether they are fisheyes; all are special cases of COLMAP's two models.
 LENSES = dict.fromkeys(("perspective", "simple_radial", "radial", "brown"), False)
@@ -88,11 +88,19 @@ def _camera(values: dict[str, Any], where: str) -> Callable[[Path], Camera]:
 
     def camera(photo: Path) -> Camera:
         width, height = (numbers[side] for side in "wh") if {"w", "h"} <= numbers.keys() else stored_size(photo)
-        focal = numbers.get("fl_x") or 0.5 * width / np.tan(0.5 * numbers.get("camera_angle_x", 0.0))
+        across, upwards = (
+            numbers.get(f"fl_{axis}") or _focal(side, numbers.get(f"camera_angle_{axis}", 0.0))
+            for axis, side in (("x", width), ("y", height))
+        )
         middle = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
-        return _bent(model == FISHEYE, (width, height), [focal, numbers.get("fl_y", focal), *middle], numbers)
+        return _bent(model == FISHEYE, (width, height), [across, upwards or across, *middle], numbers)
 
     return camera
+
+
+def _focal(side: float, angle: float) -> float:
+    """The focal length of a side of a photo seen by so wide an angle; 0 where none is given."""
+    return 0.5 * side / float(np.tan(0.5 * angle)) if angle else 0.0
 
 
 def _bent(fisheye: bool, size: tuple[float, float], straight: list[float], numbers: Mapping[str, float]) -> Camera:

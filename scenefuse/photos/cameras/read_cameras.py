@@ -32,14 +32,16 @@ REALITY = "in RealityCapture, export the registration as Bundler v0.3 (.out) wit
 # Names, or beginnings, of files that hold cameras in a form that is not read; whose they are, and what to do.
 UNREAD = {
     r"\.ps[xz]$": ("Metashape's project", METASHAPE),
-    r"\.(csv|rcproj|xmp)$": ("RealityCapture's", REALITY),
+    r"\.rcproj$|^\W*name,x,y,|\bxcr:": ("RealityCapture's", REALITY),
     r"<BlocksExchange": ("ContextCapture's BlocksExchange", "import it into Metashape, and export Agisoft XML"),
     r"\.nvm$|^NVM_V3": ("VisualSFM's NVM", "export the reconstruction as Bundler's .out with list.txt"),
     r"\.(p4d|opf)$|calibrated_(external_)?camera": ("Pix4D's", "export OPF, and convert it by opf2nerf of pyopf"),
     r"\.(sfm|mg|abc)$|\"featuresFolders\"": ("Meshroom's", "convert it to COLMAP by aliceVision_exportColmap"),
     r"\"sfm_data_version\"": ("OpenMVG's", "convert it to COLMAP by openMVG_main_openMVG2Colmap"),
     r"\"img_name\"": ("a list of Gaussian splatting", "give the model of COLMAP that it was trained on"),
+    r"poses_bounds\.npy$": ("LLFF's", "give the model of COLMAP that it was made from"),
     r"^(cameras|images|points3D)\.(txt|bin)$|^SQLite": ("a part of COLMAP's project", "give the folder of the model"),
+    r"omega\W{1,3}phi\W{1,3}kappa": ("a list of poses without lenses", "export the cameras in one of the formats read"),
 }
 # What may follow a photo's name in the list: a zero, and its focal length by EXIF.
 FOCAL = re.compile(r"\s+0\s+[-+.\deE]+$")
@@ -116,15 +118,24 @@ def _format_of(cameras: Path) -> tuple[Path, str]:
         return found[0], _program_of(found[0])
     if found:
         raise StageError(f"{cameras} holds cameras in {found[0].name} and in {found[1].name}; give one of these files")
-    raise StageError(f"{cameras} holds no cameras in a known format; give {LAYOUTS}, or a folder with one")
+    unread = next(filter(None, (_why_unread(file) for file in sorted(cameras.rglob("*")) if file.is_file())), "")
+    raise StageError(unread or f"{cameras} holds no cameras in a known format; give {LAYOUTS}, or a folder with one")
+
+
+def _why_unread(file: Path) -> str:
+    """Why a file that holds cameras in a form that is not read is not, and what to do; "" for any other."""
+    begin = head(file).decode("latin-1")
+    for pattern, (whose, advice) in UNREAD.items():
+        if any(re.search(pattern, text, re.IGNORECASE) for text in (file.name, begin)):
+            return f"{file} is not read, for it is {whose}; {advice}"
+    return ""
 
 
 def _program_of(file: Path) -> str:
     """The program whose format a file has; StageError where that is not read."""
-    begin, ending = head(file), file.suffix.lower()
-    for pattern, (whose, advice) in UNREAD.items():
-        if any(re.search(pattern, text, re.IGNORECASE) for text in (file.name, begin.decode("latin-1"))):
-            raise StageError(f"{file} is not read, for it is {whose}; {advice}")
+    ending = file.suffix.lower()
+    if why := _why_unread(file):
+        raise StageError(why)
     if ending in (".xml", BUNDLER):
         return "Bundler" if ending == BUNDLER else "Metashape"
     if file.name.startswith("reconstruction"):
