@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.cloud_file import NEIGHBOURS
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
 from scenefuse.cloud.tiled_cloud import WHOLE, write_tiled
-from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, write_json
+from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, value, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import DepthMap, Votes, back_project, neighbours, vote
 from scenefuse.geometry.photo_check import MAX_PHOTOS
@@ -65,7 +65,7 @@ def fuse_depth_maps(
         settings: see DenseCloudSettings.
         cloud: output PLY in the workspace's frame: float64 positions, normals, colours, `views` (photos
             that agree on the point).
-        report: output JSON: number of points, spacing, the share of the pixels with a depth that are in
+        report: output JSON: number of points, spacing, backend, the share of the pixels with a depth that are in
             the cloud, and a note where it is small.
 
     Raises:
@@ -78,8 +78,9 @@ def fuse_depth_maps(
     }
     if not maps:
         raise StageError(f"no depth maps in {', '.join(map(str, depth))}; run the depth stage first")
-    print(f"fusing {len(maps)} depth maps", flush=True)
-    sources = {name: photo["sources"] for path in depth_json for name, photo in read_json(path)["photos"].items()}
+    stages = [read_json(path) for path in depth_json]
+    print(f"fusing {len(maps)} depth maps by {_all(stages, 'backend')}", flush=True)
+    sources = {name: photo["sources"] for stage in stages for name, photo in stage["photos"].items()}
     fused, pixel, measured = _fuse(workspace, maps, neighbours(sources), settings)
     if len(fused) == 0:
         raise StageError(
@@ -89,13 +90,18 @@ def fuse_depth_maps(
     near = near_others(fused.points)
     kept = voxel_downsample(fused[near], pixel)
     print(f"{len(kept)} points, {(~near).sum()} of {len(fused)} dropped as outliers before thinning", flush=True)
-    content = _report(kept, measured, length_unit(georeference_json))
+    content = _report(kept, measured, stages, length_unit(georeference_json))
     write_tiled(cloud, lambda: [kept], len(kept), kept.points)
     write_json(report, content | {"depth_maps": quantity(len(maps), "1")})
 
 
-def _report(cloud: Cloud, measured: int, unit: str) -> dict[str, Any]:
-    """The cloud in numbers, with a note where it holds few of the measured pixels."""
+def _all(stages: list[dict[str, Any]], name: str) -> str:
+    """A word of all chunks' reports."""
+    return ", ".join(sorted({value(stage, name) for stage in stages}))
+
+
+def _report(cloud: Cloud, measured: int, stages: list[dict[str, Any]], unit: str) -> dict[str, Any]:
+    """The cloud in numbers, with a note where it holds few of the measured pixels; and how its depth maps were made."""
     share, notes = float(cloud.fields["views"].sum() / max(measured, 1)), []
     if share < MIN_FUSED_SHARE:
         notes.append(
@@ -108,7 +114,9 @@ def _report(cloud: Cloud, measured: int, unit: str) -> dict[str, Any]:
         "spacing": quantity(spacing(cloud.points), unit),
         "fused_share": quantity(share, "1"),
         "notes": quantity(notes, ""),
-        "backend": quantity("plane sweep", ""),
+        "backend": quantity(_all(stages, "backend"), ""),
+        "device": quantity(_all(stages, "device"), ""),
+        "reason": quantity(value(stages[0], "reason") if stages else "", ""),
     }
 
 

@@ -1,12 +1,14 @@
 """Multi-view stereo in PyTorch: a plane sweep with semi-global smoothing, then slanted refinement at full size.
 
-Every hypothesis is an inverse depth per pixel, so that one warp serves the fronto-parallel sweep and the refinement
-around a surface that is already known, where the matching window follows the slant of that surface. Sources: Collins
-1996 (plane sweep); Hirschmueller 2008 (semi-global matching).
+The CPU and GPU counterpart of COLMAP's patch-match stereo. Every hypothesis is an inverse depth per pixel, so that one
+warp serves the fronto-parallel sweep and the refinement around a surface that is already known, where the matching
+window follows the slant of that surface. Sources: Collins 1996 (plane sweep); Hirschmueller 2008 (semi-global
+matching).
 """
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -44,24 +46,29 @@ MAX_BLANK_SHARE = 0.25
 class DepthMapSettings:
     """How a scene's depth maps are made."""
 
+    backend: Literal["auto", "colmap", "torch"] = setting("auto")
+    """`colmap` needs CUDA; `torch` is our plane sweep; `auto` takes the first that can run."""
     max_image_size_px: int = setting(800, unit="px", above=0)
     """Longer side of the photo that stereo works on; the depth map has this size."""
     sources: int = setting(8, least=1)
     """Source photos per reference photo."""
     min_score: float = 0.5
-    """Smallest mean NCC of the best sources that a pixel needs to keep its depth."""
+    """Smallest mean NCC of the best sources that a pixel needs to keep its depth (torch only)."""
     min_angle_deg: float = setting(2, unit="deg", least=0)
     """Smallest median angle between the rays of a reference and a source photo."""
     best_sources: int = 3
-    """The best so many sources of a hypothesis count; the others are taken as occluded."""
+    """The best so many sources of a hypothesis count; the others are taken as occluded (torch only)."""
     planes: int = 96
-    """At most so many inverse-depth hypotheses in the sweep."""
+    """At most so many inverse-depth hypotheses in the sweep (torch only)."""
     sweep_reduction: int = 2
-    """The sweep runs on photos this much smaller; the refinement doubles the size step by step."""
+    """The sweep runs on photos this much smaller; the refinement doubles the size step by step (torch only)."""
     window_px: int = 7
     """Side of the matching window in pixels, odd."""
     smoothness: float = 0.1
-    """Semi-global cost of a step to the next plane, in units of 1 - NCC; a larger jump costs four times that."""
+    """Semi-global cost of a step to the next plane, in units of 1 - NCC; a larger jump costs four times that (torch
+    only)."""
+    geometric: bool = True
+    """Second, geometrically consistent pass of COLMAP's patch-match (colmap only)."""
 
 
 @dataclass(frozen=True)

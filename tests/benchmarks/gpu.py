@@ -3,8 +3,9 @@
 make check-gpu, or, on a machine with PyTorch, Triton and a GPU where nothing is installed:
 PYTHONPATH=.:tests python3 tests/benchmarks/gpu.py --table gpu.tsv --object results/objects/house --lego data/lego
 
-Beside PyTorch and Triton it needs NumPy, SciPy, Numba, OpenCV, PyYAML, jsonschema and tyro; pycolmap and pyproj for
-photos. Without a GPU both sides run on the CPU, which checks the checks, and the end is an error.
+Beside PyTorch and Triton it needs NumPy, SciPy, Numba, OpenCV, PyYAML, jsonschema and tyro; pycolmap (pycolmap-cuda12
+for patch-match, with X11's libraries) and pyproj for photos. Without a GPU both sides run on the CPU, which checks the
+checks, and the end is an error.
 """
 
 import dataclasses
@@ -92,7 +93,7 @@ def gpu(
         "paper_networks": paper_networks,
     }
     if object is not None:
-        checks["object"] = lambda: whole_object(object)
+        checks |= {"patch_match": lambda: patch_match(object), "object": lambda: whole_object(object)}
     if lego is not None:
         checks["lego"] = lambda: lego_to_30_db(lego)
     rows = [checked(name, check) for name, check in checks.items() if not only or name in only]
@@ -316,6 +317,40 @@ def paper_networks() -> Row:
     here, cpu, there, gpu_s = both(losses)
     note = f"photometric loss {here[0]:.4f}, {there[0]:.4f}; after twenty steps {here[1]:.4f}, {there[1]:.4f}"
     return Row("", "", abs(here[0] - there[0]) / here[0], 0.01, cpu, gpu_s, note)
+
+
+def patch_match(folder: Path) -> Row:
+    """COLMAP's patch-match on an object's photos, beside the plane sweep on the GPU: where both have a depth."""
+    import pycolmap
+
+    from scenefuse.mvs.depth_maps import estimate_depth_maps
+    from scenefuse.photos.pictures import read_depth
+
+    if not pycolmap.has_cuda:
+        raise ImportError("this pycolmap has no CUDA")
+    taken, maps = [], []
+    with tempfile.TemporaryDirectory() as name:
+        for backend in ("torch", "colmap"):
+            settings = DepthMapSettings(backend=backend, max_image_size_px=480)
+            out = Path(name) / backend
+            start = time.perf_counter()
+            estimate_depth_maps(
+                workspace=folder / "undistorted",
+                chunk=0,
+                chunks=8,
+                settings=settings,
+                seed=0,
+                depth=out,
+                report=Path(name) / f"{backend}.json",
+            )
+            taken.append(time.perf_counter() - start)
+            maps.append([read_depth(path) for path in sorted((out / "depth_maps").glob("*"))])
+    sweep, matched = (np.concatenate([m.ravel() for m in part]) for part in maps)
+    common = (sweep > 0) & (matched > 0)
+    off = np.abs(sweep - matched)[common] / sweep[common]
+    note = f"{len(maps[0])} photos; plane sweep on the GPU {taken[0]:.1f} s; depth in {(sweep > 0).mean():.3f}, "
+    note += f"{(matched > 0).mean():.3f} of the pixels; median difference"
+    return Row("", "", float(np.median(off)), 2e-3, np.nan, taken[1], note)
 
 
 def whole_object(folder: Path) -> Row:

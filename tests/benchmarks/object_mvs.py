@@ -179,10 +179,10 @@ def object_mvs(
 ) -> None:
     """Print the clouds of multi-view stereo and of the four stages; all trials go to bench/object_mvs.tsv.
 
-    Multi-view stereo is the scene's own (plane sweep and slanted refinement; its fusion) at the width of the NeRF, on
-    all photos; its depths off the mask are dropped before fusion, its points off the masks after, and it is thinned and
-    cleaned like the object's cloud. The best trial by F at 1 % is marked. Beside them stand clouds of the maps of
-    stages 1 and 3, made in the same way.
+    Multi-view stereo is the scene's own (plane sweep and slanted refinement, or COLMAP's patch-match with CUDA;
+    its fusion) at the width of the NeRF, on all photos; its depths off the mask are dropped before fusion, its
+    points off the masks after, and it is thinned and cleaned like the object's cloud. The best trial by F at 1 % is
+    marked. Beside them stand clouds of the maps of stages 1 and 3, made in the same way.
 
     Args:
         results: folder of a finished demo.

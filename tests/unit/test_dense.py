@@ -1,7 +1,8 @@
 """Stereo and fusion on a planted scene: a bumpy, textured surface of known depth seen by five cameras."""
 
-import shutil
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,7 +21,9 @@ from scenefuse.photos.pictures import read_depth, read_normals, write_depth, wri
 from scenefuse.photos.workspace import View
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
-DEPTH = DepthMapSettings(max_image_size_px=160, sources=4, min_angle_deg=1.0, best_sources=2, planes=48)
+DEPTH = DepthMapSettings(
+    backend="torch", max_image_size_px=160, sources=4, min_angle_deg=1.0, best_sources=2, planes=48
+)
 FUSION = DenseCloudSettings(max_normal_error_deg=20)
 
 
@@ -142,7 +145,7 @@ def test_chunks_share_out_the_photos(maps):
     names = [sorted(p.name for p in (maps / f"{k}" / "depth_maps").iterdir()) for k in range(2)]
     assert names == [["1.png.bin", "3.png.bin", "5.png.bin"], ["2.png.bin", "4.png.bin"]]
     report = read_json(maps / "1.json")
-    assert value(report, "chunk") == "1 of 2"
+    assert value(report, "backend") == "torch"
     assert set(report["photos"]) == {"2.png", "4.png"}
     assert report["photos"]["2.png"]["near"] < 9 < 11 < report["photos"]["2.png"]["far"]
 
@@ -195,24 +198,63 @@ def test_a_point_far_from_all_others_is_found_in_clouds_of_any_size(monkeypatch)
     assert not whole[7] and whole.mean() > 0.99 and np.array_equal(dense_cloud.near_others(points), whole)
 
 
-def test_photos_in_subfolders_have_their_maps_there(workspace, tmp_path):
+@pytest.fixture
+def patch_match(monkeypatch):
+    """Stands in for COLMAP's patch-match, which needs CUDA: a flat map for every photo listed; the folders it ran in.
+
+    Like COLMAP it makes no folders, and the system's temporary folder is on another file system where there is one.
+    """
+    folders = []
+
+    def stereo(folder, _format, _option, options, cancellation_token):
+        folders.append(folder)
+        names = (folder / "stereo" / "patch-match.cfg").read_text().splitlines()[::2]
+        for name in names:
+            for part in ("depth_maps", "normal_maps", "consistency_graphs"):
+                assert (folder / "stereo" / part / name).parent.is_dir()
+            shape = (options.max_image_size * HEIGHT // WIDTH, options.max_image_size)
+            write_depth(folder / "stereo" / "depth_maps" / f"{name}.geometric.bin", np.full(shape, 5, np.float32))
+            normals = np.zeros((*shape, 3), np.float32)
+            write_normals(folder / "stereo" / "normal_maps" / f"{name}.geometric.bin", normals)
+
+    monkeypatch.setattr(pycolmap, "has_cuda", True)
+    monkeypatch.setattr(pycolmap, "patch_match_stereo", stereo)
+    if Path("/dev/shm").is_dir():
+        monkeypatch.setattr(tempfile, "tempdir", "/dev/shm")
+    return folders
+
+
+def test_maps_of_patch_match_reach_their_place_from_subfolders_without_leaving_the_file_system(
+    workspace, patch_match, tmp_path
+):
     walks = tmp_path / "workspace"
-    for folder in ("sparse", "images/walk0", "images/walk1"):
-        (walks / folder).mkdir(parents=True)
+    (walks / "sparse").mkdir(parents=True)
     model = pycolmap.Reconstruction(workspace / "sparse")
     for key, image in model.images.items():
-        shutil.copyfile(workspace / "images" / image.name, walks / f"images/walk{key % 2}" / image.name)
         image.name = f"walk{key % 2}/{image.name}"
     model.write_binary(walks / "sparse")
     estimate_depth_maps(
-        workspace=walks, chunk=0, chunks=2, settings=replace(DEPTH, max_image_size_px=80), seed=0,
+        workspace=walks, chunk=0, chunks=2, settings=replace(DEPTH, backend="colmap", max_image_size_px=80), seed=0,
         depth=tmp_path / "depth" / "0", report=tmp_path / "depth" / "0.json",
     )  # fmt: skip
     assert read_depth(tmp_path / "depth/0/depth_maps/walk0/2.png.bin").shape == (60, 80)
-    assert sorted(read_json(tmp_path / "depth/0.json")["photos"]) == ["walk0/2.png", "walk1/1.png", "walk1/5.png"]
+    report = read_json(tmp_path / "depth/0.json")
+    names = ["walk0/2.png", "walk1/1.png", "walk1/5.png"]
+    assert value(report, "backend") == "colmap" and sorted(report["photos"]) == names
     assert read_normals(tmp_path / "depth/0/normal_maps/walk1/5.png.bin").shape == (60, 80, 3)
-    # The temporary folder lay beside the maps, and is gone.
+    # The temporary workspace lay beside the maps, and is gone.
+    assert all(folder.is_relative_to(tmp_path / "depth") and not folder.exists() for folder in patch_match)
     assert sorted(p.name for p in (tmp_path / "depth").iterdir()) == ["0", "0.json"]
+
+
+def test_a_photo_without_a_map_of_patch_match_is_named(workspace, patch_match, monkeypatch, tmp_path):
+    monkeypatch.setattr(pycolmap, "patch_match_stereo", lambda *_, **__: None)
+    with pytest.raises(StageError, match="patch-match left no 1.png.geometric.bin in depth_maps"):
+        estimate_depth_maps(
+            workspace=workspace, chunk=0, chunks=1, settings=replace(DEPTH, backend="colmap"), seed=0,
+            depth=tmp_path / "depth", report=tmp_path / "depth.json",
+        )  # fmt: skip
+    assert not list(tmp_path.iterdir())
 
 
 def test_errors_are_sentences(workspace, maps, tmp_path):
@@ -220,6 +262,11 @@ def test_errors_are_sentences(workspace, maps, tmp_path):
     common = {"workspace": workspace, "settings": DEPTH, "seed": 0}
     with pytest.raises(StageError, match="chunk 2 of 2 does not exist"):
         estimate_depth_maps(chunk=2, chunks=2, **common, **outputs)
+    if not pycolmap.has_cuda:
+        with pytest.raises(StageError, match="needs CUDA"):
+            estimate_depth_maps(
+                chunk=0, chunks=1, **(common | {"settings": replace(DEPTH, backend="colmap")}), **outputs
+            )
     with pytest.raises(StageError, match="not a readable COLMAP model"):
         estimate_depth_maps(chunk=0, chunks=1, **(common | {"workspace": tmp_path}), **outputs)
     fusion = {"workspace": workspace, "settings": FUSION, "cloud": tmp_path / "c.ply", "report": tmp_path / "c.json"}

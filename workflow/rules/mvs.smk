@@ -9,7 +9,7 @@ CHUNKS = range(config["scene"]["chunks"])
 
 
 rule estimate_depth_maps:
-    """Depth maps of one chunk of the photos: a plane sweep."""
+    """Depth maps of one chunk of the photos: COLMAP's patch-match on CUDA, else our plane sweep."""
     input:
         workspace="results/scenes/{scene}/undistorted",
         report="results/scenes/{scene}/undistorted.json",
