@@ -263,9 +263,7 @@ class Triples(NamedTuple):
     scale: Array
 
 
-def triples_of_one_scale(
-    x: Array, y: Array, count: int, rng: np.random.Generator, min_ratio: float = MIN_EDGE_RATIO
-) -> Triples:
+def triples_of_one_scale(x: Array, y: Array, count: int, rng: np.random.Generator) -> Triples:
     """Random triples of matches whose three edges are longer on one side by nearly the same factor (Fischler 1981).
 
     Args:
@@ -273,11 +271,10 @@ def triples_of_one_scale(
         y: (M, 3) their partners.
         count: triples drawn.
         rng: draws them.
-        min_ratio: least of a triple's three factors over the largest.
     """
     rows = rng.integers(0, len(x), (count, 3))
     a, b = (np.linalg.norm(side[rows] - side[np.roll(rows, 1, axis=1)], axis=2) for side in (x, y))
     ratio = b / np.maximum(a, 1e-12)
-    good = ratio.min(1) > min_ratio * ratio.max(1)
+    good = ratio.min(1) > MIN_EDGE_RATIO * ratio.max(1)
     scale = np.exp(np.log(np.maximum(ratio[good], 1e-12)).mean(1))
     return Triples(rows[good], (a[good], b[good]), scale)

@@ -2,9 +2,9 @@
 
 RMS-ratio scale, rigid RANSAC on FPFH matches, then point-to-point ICP, all by Open3D (method R1, R2, R5 to R8).
 
-The paper's: the scale, the ratio of the RMS distances to the centroids, held from then on, over all points as in its
-formula (variant `paper`) or over matched ones as in its text (recipe `paper`); a voxel of 4 % of the diagonal; RANSAC
-within 1.5 voxels, 4,000,000 samples; ICP within 0.4 voxel, 35 iterations.
+The paper's: the scale, the ratio of the RMS distances to the centroids over all points, as in its formula, held from
+then on; a voxel of 4 % of the diagonal; RANSAC within 1.5 voxels, 4,000,000 samples; ICP within 0.4 voxel, 35
+iterations.
 
 Mended: the printed ratio is inverted (R1). RANSAC's second limit, 500, belongs to an old Open3D; today's is a
 confidence, here 0.999 (R5). The diagonal, of which cloud is not said, is the scene crop's (R6).
@@ -21,12 +21,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import quantity, write_json
-from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.geometry.icp import ScaleRange, triples_of_one_scale
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import SCORE_FRACTION
 from scenefuse.register.coarse import coarse_quantities
 from scenefuse.register.decision import FineSettings, tilt_deg
@@ -34,11 +33,9 @@ from scenefuse.register.fine import draw_alignment, pose_quantities
 from scenefuse.register.problem import (
     SURFACE_POINTS,
     Constraints,
-    Estimate,
     Inputs,
     Problem,
     estimates,
-    rms,
     scale_quantities,
 )
 from scenefuse.register.score import Hypothesis, score
@@ -57,8 +54,6 @@ RANSAC_SAMPLES, CONFIDENCE = 4_000_000, 0.999
 ICP_DISTANCE, ICP_SPACING, ICP_ITERATIONS = 0.4, 0.5, 35
 # Open3D leaves mutual filtering out when fewer than this share of the points have a mutual match.
 MIN_MUTUAL_SHARE = 0.1
-# How much the sizes of object and crop, which is cut to it, may differ.
-MAX_SCALE_FACTOR = 2.0
 
 
 def register_as_paper(
@@ -68,7 +63,7 @@ def register_as_paper(
     coarse_report: Path,
     report: Path,
     picture: Path | None = None,
-    scale: Literal["rms", "ransac_svd", "none"] = "rms",
+    scale: Literal["rms", "none"] = "rms",
     seed: int,
 ) -> None:
     """Register an object by the paper's recipe: scale, coarse and fine registration, nothing rejected.
@@ -79,8 +74,8 @@ def register_as_paper(
         coarse_report: output JSON as of the coarse stage.
         report: output JSON as of the fine stage; its `status` is `ungated`, what has no gate is null.
         picture: output PNG, the object on the scene crop from three sides.
-        scale: `rms` over whole clouds, the paper's formula, or `ransac_svd` over matches, its text; `none` takes the
-            object as large as it is, the paper's ablation.
+        scale: `rms` over whole clouds, the paper's formula; `none` takes the object as large as it is, the paper's
+            ablation.
         seed: of RANSAC.
 
     Raises:
@@ -89,13 +84,6 @@ def register_as_paper(
     obj, scene = inputs.clouds()
     ups = inputs.ups()
     ledger = estimates(obj, scene, ups)
-    said: list[str] = []
-    if scale == "ransac_svd":
-        matched, said = matched_scale(obj, scene, seed)
-        if matched is None:
-            scale = "rms"
-        else:
-            ledger = [Estimate(scale, matched, True), *ledger]
     held = 1.0 if scale == "none" else ledger[0].scale
     problem = Problem(obj, scene, ScaleRange(held, 0.0), Constraints(ups), seed)
     pose, notes = paper_coarse(problem)
@@ -104,7 +92,7 @@ def register_as_paper(
     if picture is not None:
         draw_alignment(picture, obj, scene, fine.pose, seed)
     write_json(scale_report, scale_quantities(ledger, problem.scales, scale))
-    write_json(coarse_report, coarse_quantities([coarse], False, [*said, *notes]))
+    write_json(coarse_report, coarse_quantities([coarse], False, notes))
     write_json(report, _report(fine, problem, inputs.length_unit()))
 
 
@@ -129,51 +117,6 @@ def _report(best: Hypothesis, problem: Problem, length: str) -> dict[str, Any]:
         **uncertainty_quantities(None, length),
         "hypotheses": quantity([best.as_json()], ""),
     }
-
-
-def matched_scale(cloud: Cloud, scene: Cloud, seed: int) -> tuple[float | None, list[str]]:
-    """Scene units per object unit from matched points, and notes: None where too few agree.
-
-    Mutual FPFH matches of both clouds at a diagonal of 1 (R4), RANSAC with a similarity by SVD, then the ratio of the
-    RMS distances of the matches that agree to their centroids. Open3D's RANSAC does not say which matches agree, but
-    which points then lie near each other, whatever they match.
-    """
-    import open3d as o3d
-
-    unit = [Cloud(c.points / c.diagonal) for c in (cloud, scene)]
-    (source, of_source), (target, of_target) = (_features(c.points, VOXEL_FRACTION) for c in unit)
-    # A ratio of 0: no one-way matches in the place of too few mutual ones.
-    pairs = np.asarray(o3d.pipelines.registration.correspondences_from_features(of_source, of_target, True, 0.0))
-    matched = np.asarray(source.points)[pairs[:, 0]], np.asarray(target.points)[pairs[:, 1]]
-    agree = agreeing(*matched, RANSAC_DISTANCE * VOXEL_FRACTION, seed)
-    said = f"{agree.sum()} of {len(pairs)} mutual matches agree"
-    print(said, flush=True)
-    if agree.sum() < 3:
-        return None, [f"{said}, too few: the scale is the RMS ratio of the whole clouds"]
-    ratio = rms(matched[1][agree]) / rms(matched[0][agree])
-    return ratio * scene.diagonal / cloud.diagonal, [said]
-
-
-def agreeing(source: Array, target: Array, distance: float, seed: int) -> NDArray[np.bool_]:
-    """Which matches (N, 3) and (N, 3) a similarity explains within `distance`: the most that RANSAC finds.
-
-    Triples agree on one scale as Open3D asks it of edges, and it is within a factor of `MAX_SCALE_FACTOR` of 1: a
-    similarity that shrinks the object into a spot explains everything.
-    """
-    best = np.zeros(len(source), dtype=bool)
-    rng, drawn, wanted, at_once = np.random.default_rng(seed), 0, float(RANSAC_SAMPLES), 1 << 14
-    while len(source) and drawn < wanted:
-        triples, drawn = triples_of_one_scale(source, target, at_once, rng, EDGE_LENGTH), drawn + at_once
-        for rows in triples.rows[np.abs(np.log(triples.scale)) < np.log(MAX_SCALE_FACTOR)]:
-            try:
-                pose = fit_sim3(source[rows], target[rows])
-            except ValueError:  # along one line
-                continue
-            found = np.linalg.norm(pose.apply(source) - target, axis=1) <= distance
-            if found.sum() > best.sum():
-                best = found
-                wanted = min(RANSAC_SAMPLES, np.log(1 - CONFIDENCE) / np.log1p(-min(found.mean() ** 3, CONFIDENCE)))
-    return best
 
 
 def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:

@@ -40,4 +40,4 @@ def test_the_papers_stages_run_in_the_place_of_the_shipped_ones_and_only_when_as
         scales = [
             re.search(r"--scale (\w+)", words)[1] for script, words in jobs if script.endswith("register_as_paper")
         ]
-        assert sorted(scales) == ["none", "ransac_svd", "ransac_svd"]
+        assert sorted(scales) == ["none", "rms", "rms"]

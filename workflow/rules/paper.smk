@@ -188,9 +188,9 @@ use rule make_object_cloud as make_cloud_as_paper with:
 
 
 def scale_of_paper(wildcards):
-    """How large a variant takes the object: by the paper's text, or as it is in the ablation (R2)."""
+    """How large a variant takes the object: by the paper's formula, or as it is in the ablation (R2)."""
     without = "scale" in registration_of(wildcards)
-    return f"--scale {'none' if without else 'ransac_svd'}"
+    return f"--scale {'none' if without else 'rms'}"
 
 
 use rule register_as_paper as register_variant_as_paper with:
