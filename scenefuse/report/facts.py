@@ -160,7 +160,7 @@ def scene_facts(row: Row) -> dict[str, str]:
         place = f"{abs(north):.5f}° {'NS'[north < 0]}, {abs(east):.5f}° {'EW'[east < 0]}"
         facts["Place"] = f"{place}; from there the local frame counts metres east, north and up"
     if found := accuracies(row):
-        facts["Position"] = f"{found[0]}: absolute, where on Earth the scene lies"
+        facts["Position"] = f"absolute, where on Earth the scene lies: {found[0]}"
     if "gps_scale_sd_log" in has:
         facts["Lengths"] = f"{_of_lengths(has['gps_scale_sd_log'], unit)}, by the photos' GPS"
     if "ground_pixel" in has:

@@ -44,7 +44,7 @@ def write_pdf(
         page.facts(scene_facts(of_scene.get(folder.name, {"error": "not run yet"})))
     page.text_line("Objects", 12)
     verdicts = [WORDS["badges"].get(row["status"], row["status"]) for row in rows]
-    found = [[each.get("Size", "-"), shorten(each.get("Surface", each["Result"]), 150)] for each in facts]
+    found = [[each.get("Size", "-"), shorten(each.get("Surface", each["Result"]).split(";")[0], 150)] for each in facts]
     page.rows([[f.name, verdict, *more] for f, verdict, more in zip(objects, verdicts, found)], (3, 3, 7, 12))
     for folder in scenes:
         page.pictures([folder / "scene.png"], [f"scene {folder.name}, its cameras and their errors"])

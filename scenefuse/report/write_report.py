@@ -63,7 +63,9 @@ def write_report(
     )
     rows = [of_object.get(folder.name, {"object": folder.name, "status": "missing"}) for folder in objects]
     shown = list(zip(objects, rows))
-    links = "".join(f'<a href="#{escape(folder.name)}">{escape(folder.name)}</a>{_badge(row)}' for folder, row in shown)
+    links = "".join(
+        f'<span><a href="#{escape(folder.name)}">{escape(folder.name)}</a>{_badge(row)}</span>' for folder, row in shown
+    )
     body = [
         f"<header><h1>{escape(title)}</h1><p>{escape(made_by(summary))} {texts['intro']}</p>",
         f"<nav>{links}</nav></header>",
@@ -101,7 +103,11 @@ def _views(folders: list[Path]) -> dict[Path, View]:
 
 def _facts(facts: dict[str, str]) -> str:
     """Labels and sentences; files of the results are links from results/summary/, where the page is."""
-    linked = {k: re.sub(r"results/([\w./-]*\w)", r'<a href="../\1">\g<0></a>', escape(v)) for k, v in facts.items()}
+
+    def link(file: re.Match[str]) -> str:
+        return f'<a href="../{file[1]}">{file[0].replace("/", "/<wbr>")}</a>'
+
+    linked = {label: re.sub(r"results/([\w./-]*\w)", link, escape(text)) for label, text in facts.items()}
     return f"<dl>{''.join(f'<div><dt>{k}</dt><dd>{text}</dd></div>' for k, text in linked.items())}</dl>"
 
 
@@ -152,7 +158,7 @@ def _slider(figures: Path) -> str:
 
 def _scene_card(folder: Path, view: View | None, texts: Texts) -> str:
     """A scene with its objects in 3D, and its figure."""
-    parts = [f'<section class="card" id="scene-{escape(folder.name)}"><h2>The scene {escape(folder.name)}</h2>']
+    parts = [f'<section class="card" id="scene-{escape(folder.name)}"><h2>Scene {escape(folder.name)} in pictures</h2>']
     if view is not None:
         parts.append(view_section(f"scene-{folder.name}", f"scene {folder.name}", view))
     return "\n".join([*parts, figure(folder / "scene.png", texts["scene_figure"]), "</section>"])

@@ -341,7 +341,7 @@ QUESTIONS = {
     "when were the close-ups taken?": "taken 2024-06-02",
     "how many photos?": "40 of 40 used",
     "may I trust the scale?": r"known to 0\.2 %, 22\.4 mm in 10 m",
-    "where is the file?": r"objects/house/fused\.ply",
+    "where is the file?": r"objects/\s*house/\s*fused\.ply",
     "what next?": "photograph it from 4 places",
     "who made it?": r"Made by Hof Müller, scenefuse \d.* on 20\d\d-",
     "which frame?": r"with its surroundings \(local frame, metres\)",
