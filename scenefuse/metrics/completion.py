@@ -1,6 +1,5 @@
 """Unsupervised quality of what was added: surface variation, uniformity of density, primitives; each with its null."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -83,75 +82,55 @@ def completion_of(before: Array, after: Cloud, source: int, diagonal: float) -> 
     return Completion(before, before[still], after.points[origin == source], diagonal)
 
 
-def completion_metrics(parts: Sequence[Completion], settings: MetricSettings, seed: int) -> dict[str, dict[str, Any]]:
-    """The completion.* numbers of one object, or of a scene's objects together (method G2 to G5).
+def completion_metrics(part: Completion, settings: MetricSettings, seed: int) -> dict[str, dict[str, Any]]:
+    """The completion.* numbers of an object (method G2 to G5).
 
     A name alone is the paper's measure of the added points P_new in the completed cloud. `_null` is the same with a
     random cloud in the place of P_new, as many points, uniform in its bounding box: what the measure gives for nothing.
-    `_before` and `_after` are the same measure of all points of the incomplete and of the completed cloud. Objects that
-    added next to nothing are left out; several count by their points.
+    `_before` and `_after` are the same measure of all points of the incomplete and of the completed cloud. All are null
+    where next to nothing was added.
 
     Args:
-        parts: the objects that were fused.
+        part: the object that was fused.
         settings: see MetricSettings.
         seed: of samples and of the null cloud.
     """
-    added = quantity(sum(len(part.added) for part in parts), "points")
-    parts = [part for part in parts if len(part.added) >= 4 * settings.density_neighbours]
-    if not parts:
+    added = quantity(len(part.added), "points")
+    if len(part.added) < 4 * settings.density_neighbours:
         return {n: quantity(None, "1") for m in MEASURES for n in (m, f"{m}_null")} | {"added_points": added}
-    random = [replace(part, added=_random_cloud(part.added, seed)) for part in parts]
-    real, null = _of_added(parts, settings, seed), _of_added(random, settings, seed)
+    random = np.random.default_rng(seed).uniform(part.added.min(0), part.added.max(0), part.added.shape)
+    real, null = _of_added(part, settings, seed), _of_added(replace(part, added=random), settings, seed)
     found: dict[str, dict[str, Any]] = {}
-    for name in real:
+    for name in MEASURES:
         found |= {name: quantity(real[name], "1"), f"{name}_null": quantity(null[name], "1")}
-    for when, clouds in (("before", [part.before for part in parts]), ("after", [part.after for part in parts])):
-        for name, number in _variation_and_primitives(clouds, clouds, parts, settings, seed).items():
+    for when, cloud in (("before", part.before), ("after", part.after)):
+        for name, number in _variation_and_primitives(cloud, cloud, part, settings, seed).items():
             found[f"{name}_{when}"] = quantity(number, "1")
     return found | {"added_points": added}
 
 
-def _random_cloud(like: Array, seed: int) -> Array:
-    return np.random.default_rng(seed).uniform(like.min(0), like.max(0), like.shape)
-
-
-def _of_added(parts: Sequence[Completion], settings: MetricSettings, seed: int) -> dict[str, float | None]:
-    """Every number of the added points, the objects weighted by their number."""
-    after, k = [part.after for part in parts], settings.density_neighbours
-    new = _spread(after, k, settings.sample, seed)
-    old = _spread([part.before for part in parts], k, settings.sample, seed)
-    found = _variation_and_primitives(after, [part.added for part in parts], parts, settings, seed)
-    nue = {"nue": new[1] / old[1], "nue_density_invariant": (new[1] / new[0]) / (old[1] / old[0])}
-    return {name: (found | nue)[name] for name in MEASURES}
+def _of_added(part: Completion, settings: MetricSettings, seed: int) -> dict[str, float | None]:
+    """Every number of the added points."""
+    densities = [
+        local_density(cloud, sampled(cloud, settings.sample, seed), settings.density_neighbours)
+        for cloud in (part.after, part.before)
+    ]
+    (mean, spread), (mean_before, spread_before) = ((float(rho.mean()), float(rho.std())) for rho in densities)
+    return _variation_and_primitives(part.after, part.added, part, settings, seed) | {
+        "nue": spread / spread_before,
+        "nue_density_invariant": (spread / mean) / (spread_before / mean_before),
+    }
 
 
 def _variation_and_primitives(
-    clouds: Sequence[Array], of: Sequence[Array], parts: Sequence[Completion], settings: MetricSettings, seed: int
+    cloud: Array, of: Array, part: Completion, settings: MetricSettings, seed: int
 ) -> dict[str, float | None]:
-    """Surface variation and primitives of clouds, one for each object, at some of the points `of` each.
-
-    The objects are weighted by the number of these points.
-    """
-    at, weights = [sampled(points, settings.sample, seed) for points in of], [len(points) for points in of]
-    radii = [settings.variation_spacings * spacing(part.before) for part in parts]
-    smooth = [surface_variation(*given) for given in zip(clouds, at, radii)]
-    plain = [_primitives(c, a, p.diagonal, settings, seed) for c, a, p in zip(clouds, at, parts)]
-    return {"surface_variation": _mean(smooth, weights), "primitive_fitting_score": _mean(plain, weights)}
-
-
-def _mean(values: Sequence[float | None], weights: Sequence[int]) -> float | None:
-    """The weighted mean of the values that exist."""
-    there = [(value, weight) for value, weight in zip(values, weights) if value is not None]
-    return float(np.average([v for v, _ in there], weights=[w for _, w in there])) if there else None
-
-
-def _spread(clouds: Sequence[Array], k: int, sample: int, seed: int) -> tuple[float, float]:
-    """Mean and standard deviation of the local densities of several clouds, each counted by its points."""
-    found = [local_density(cloud, sampled(cloud, sample, seed), k) for cloud in clouds]
-    weights = np.concatenate([np.full(len(rho), len(cloud) / len(rho)) for rho, cloud in zip(found, clouds)])
-    rho = np.concatenate(found)
-    mean = float(np.average(rho, weights=weights))
-    return mean, float(np.sqrt(np.average((rho - mean) ** 2, weights=weights)))
+    """Surface variation and primitives of a cloud, at some of the points `of`."""
+    at = sampled(of, settings.sample, seed)
+    return {
+        "surface_variation": surface_variation(cloud, at, settings.variation_spacings * spacing(part.before)),
+        "primitive_fitting_score": _primitives(cloud, at, part.diagonal, settings, seed),
+    }
 
 
 def _primitives(cloud: Array, at: Array, diagonal: float, settings: MetricSettings, seed: int) -> float:

@@ -1,4 +1,4 @@
-"""The metrics stages: of one object's registration and completion, and of a scene with all its objects."""
+"""The metrics of one object's registration and completion."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 
 from scenefuse.cloud.clouds import read_cloud
-from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.fuse.write import Source
@@ -57,37 +56,11 @@ def compute_metrics(
             if np.isfinite(known).any():
                 content["object"][name] = quantity(float(np.nanmedian(known)), unit)
         part = completion_of(scene.points, after, Source.OBJECT, diagonal)
-        content["completion"] = completion_metrics([part], settings, seed)
-    _write(report, content)
-
-
-def compute_scene_metrics(
-    *, completed: Path, completed_json: Path, objects: list[Path], report: Path, seed: int, settings: MetricSettings
-) -> None:
-    """Measure the completed scene (method G2 to G5): the objects that were added to it, each counted by its points.
-
-    Args:
-        completed: the completed scene (PLY, with `source`).
-        completed_json: its JSON: the object of each `source`, and the objects that are in it.
-        objects: result folders of all the scene's objects; of those in it, registration/full/crop.ply and crop.json are
-            read.
-        report: output JSON with `completion`; a measure is null where nothing was added.
-        seed: of samples and of the random clouds that give the null values.
-        settings: see MetricSettings.
-    """
-    whole, known = open_cloud(completed), read_json(completed_json)
-    numbers = {name: int(number) for number, name in value(known, "sources").items()}
-    parts = []
-    for folder in objects:
-        if value(known, "added_points").get(folder.name, 0) == 0:
-            continue
-        crop = folder / "registration/full"
-        before, diagonal = read_cloud(crop / "crop.ply").points, float(value(read_json(crop / "crop.json"), "diagonal"))
-        # What an object adds lies no farther from its crop than the object is wide.
-        around = whole.near(before.min(0) - diagonal, before.max(0) + diagonal)[1]
-        parts.append(completion_of(before, around, numbers[folder.name], diagonal))
-    found = completion_metrics(parts, settings, seed) | {"objects": quantity(len(parts), "objects")}
-    _write(report, {"completion": found})
+        content["completion"] = completion_metrics(part, settings, seed)
+    for group in content.values():
+        for name, item in group.items():
+            print(f"{name:34s} {item['value']} {item['unit']}", flush=True)
+    write_json(report, content)
 
 
 def box_size(points: Array) -> list[float]:
@@ -96,11 +69,3 @@ def box_size(points: Array) -> list[float]:
     inside = points[((points >= low) & (points <= high)).all(1)]
     ground_plan = cv2.minAreaRect((inside[:, :2] - low[:2]).astype(np.float32))[1]
     return [*sorted(map(float, ground_plan), reverse=True), float(high[2] - low[2])]
-
-
-def _write(report: Path, content: dict[str, dict[str, Any]]) -> None:
-    """Write the metrics, and print one a line."""
-    for group in content.values():
-        for name, item in group.items():
-            print(f"{name:34s} {item['value']} {item['unit']}", flush=True)
-    write_json(report, content)

@@ -66,8 +66,8 @@ class SceneSummary:
 
     Attributes:
         name: the scene's name.
-        fields: its stages' quantities, `dense.points` for instance; with those of the completed scene and its metrics
-            where it holds all decisions.
+        fields: its stages' quantities, `dense.points` for instance; with those of the completed scene where it
+            holds all decisions.
         missing: the first file up to its cloud that should be there and is not, or "".
         failed: why a job of it failed, when something is missing; "" when nothing failed.
     """
@@ -145,7 +145,7 @@ def summarise(run: RunInputs) -> RunSummary:
     for folder in run.scenes:
         of_scene = [item for item, scene in zip(objects, run.scene_of) if scene == folder.name]
         undecided = {item.name for item in of_scene if item.status(run.variants[0]) in ("failed", "missing")}
-        completed = read_fields(folder, ["completed.json", "metrics.json"])
+        completed = read_fields(folder, ["completed.json"])
         # Otherwise it is from before an object failed or was mended.
         if not scenes[folder.name].missing and set(find(completed, "completed.failed") or {}) == undecided:
             scenes[folder.name].fields.update(completed)

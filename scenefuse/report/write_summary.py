@@ -14,7 +14,6 @@ import yaml
 
 from scenefuse.core.stage import atomic_file
 from scenefuse.core.version import VERSION
-from scenefuse.metrics.completion import MEASURES
 from scenefuse.report.facts import (
     accuracies,
     diagnose,
@@ -141,7 +140,7 @@ def runtime_table(benchmarks: Path, forecast: Mapping[str, float]) -> pd.DataFra
 
 
 def scenes_table(scenes: list[SceneSummary], inputs: RunInputs) -> pd.DataFrame:
-    """One row a scene: photos, cameras, georeference, cloud, metrics of the completed scene, errors against truth.
+    """One row a scene: photos, cameras, georeference, cloud, errors against truth.
 
     Args:
         scenes: what the run has left of them.
@@ -156,9 +155,6 @@ def scenes_table(scenes: list[SceneSummary], inputs: RunInputs) -> pd.DataFrame:
             row["ground_pixel"] = ground_pixel(folder / "georeferenced")
         row["gps_scale_sd_log"] = _scale_sd(fields)
         row["completed_by"] = None if added is None else ", ".join(added) or "none"
-        for measure in (name for m in MEASURES for name in (m, *(f"{m}_{beside}" for beside in BESIDE))):
-            if f"metrics.completion.{measure}" in fields:
-                row[measure] = find(fields, f"metrics.completion.{measure}")
         for key, entry in fields.items():
             if key.startswith("truth.") and isinstance(entry["value"], (int, float)):
                 row[key.removeprefix("truth.")] = entry["value"]

@@ -18,7 +18,7 @@ from scenefuse.metrics.completion import (
     primitive_fitting_score,
     surface_variation,
 )
-from scenefuse.metrics.compute_metrics import box_size, compute_metrics, compute_scene_metrics
+from scenefuse.metrics.compute_metrics import box_size, compute_metrics
 from scenefuse.register.score import registration_metrics, self_consistency
 
 SETTINGS = MetricSettings(
@@ -172,7 +172,7 @@ def test_a_five_times_denser_completion_shows_in_nue_but_not_in_its_invariant_fo
     rng = np.random.default_rng(0)
     scene, dense = (rng.uniform(0, 4, (n, 3)) * [1, 1, 0] for n in (2000, 10000))
     settings = replace(SETTINGS, primitive_most=2)
-    found = completion_metrics([Completion(scene, scene[:0], dense, 6.0)], settings, 0)
+    found = completion_metrics(Completion(scene, scene[:0], dense, 6.0), settings, 0)
     assert found["nue"]["value"] == pytest.approx(5, rel=0.25)
     assert found["nue_density_invariant"]["value"] == pytest.approx(1, rel=0.2)
 
@@ -183,7 +183,7 @@ def test_nue_is_of_the_completed_cloud_not_only_of_what_was_added():
     scene, dense = (rng.uniform(0, 4, (n, 3)) * [1, 1, 0] for n in (4000, 10000))
     half = scene[scene[:, 0] < 2]
     settings = replace(SETTINGS, primitive_most=2)
-    found = completion_metrics([Completion(scene, half, dense * [0.5, 1, 1] + [2, 0, 0], 6.0)], settings, 0)
+    found = completion_metrics(Completion(scene, half, dense * [0.5, 1, 1] + [2, 0, 0], 6.0), settings, 0)
     # By hand: densities 1 and 5 at 1 and 5 shares of the points; 16 neighbours add a quarter of each as noise.
     mean, noise = (1 * 1 + 5 * 5) / 6, 0.25
     spread = np.sqrt(((1 - mean) ** 2 + 5 * (5 - mean) ** 2) / 6 + noise**2 * (1 + 5 * 25) / 6)
@@ -203,49 +203,17 @@ def test_what_fusion_took_away_counts_no_longer():
     )
     part = completion_of(np.concatenate([bad, good]), fused, 3, 9.0)
     assert np.array_equal(np.sort(part.kept, axis=0), np.sort(good, axis=0)) and np.array_equal(part.added, new)
-    found = completion_metrics([part], replace(SETTINGS, primitive_most=3), 0)
+    found = completion_metrics(part, replace(SETTINGS, primitive_most=3), 0)
     before, after = (found[f"surface_variation_{when}"]["value"] for when in ("before", "after"))
     assert after < 1e-9 < 0.01 < before
     before, after = (found[f"primitive_fitting_score_{when}"]["value"] for when in ("before", "after"))
     assert after > 0.95 > 0.8 > before
 
 
-def test_objects_of_a_scene_count_by_their_points():
-    rng = np.random.default_rng(0)
-    scene = rng.uniform(0, 4, (2000, 3)) * [1, 1, 0]
-    smooth = rng.uniform(0, 4, (3000, 3)) * [1, 1, 0] + [4.2, 0, 0]
-    rough = rng.uniform(0, 4, (1000, 3)) * [1, 1, 0.2] + [4.2, 0, 0]
-    parts = [Completion(scene, scene, added, 6.0) for added in (smooth, rough, smooth[:3])]
-    settings = replace(SETTINGS, primitive_most=2)
-    alone, both = completion_metrics(parts[1:2], settings, 0), completion_metrics(parts, settings, 0)
-    assert both["surface_variation"]["value"] == pytest.approx(alone["surface_variation"]["value"] / 4, rel=0.02)
-    assert both["added_points"]["value"] == 4003
-    nothing = completion_metrics([parts[2]], settings, 0)
-    assert nothing["nue"]["value"] is None and nothing["added_points"]["value"] == 3
-
-
-def test_the_completed_scene_is_measured_over_the_objects_that_are_in_it(tmp_path):
-    rng = np.random.default_rng(0)
-    roof = np.array([[1, 0, 0.5], [0, 1, 0], [0, 0, 0]])  # x slopes
-    crop, added = (rng.uniform(0, 4, (1000, 3)) @ roof + [x, 0, x / 2] for x in (0, 4))
-    whole = Cloud(np.concatenate([crop, added]), fields={"source": np.repeat([0, 2], 1000).astype(np.uint16)})
-    write_cloud(tmp_path / "completed.ply", whole)
-    known = {"sources": {"0": "scene", "1": "barn", "2": "shed"}, "added_points": {"shed": 1000}}
-    write_json(tmp_path / "completed.json", {name: quantity(item, "") for name, item in known.items()})
-    write_cloud(tmp_path / "shed/registration/full/crop.ply", Cloud(crop))
-    write_json(tmp_path / "shed/registration/full/crop.json", {"diagonal": quantity(6.0, "m")})
-    compute_scene_metrics(
-        completed=tmp_path / "completed.ply",
-        completed_json=tmp_path / "completed.json",
-        objects=[tmp_path / "barn", tmp_path / "shed"],
-        report=tmp_path / "metrics.json",
-        seed=0,
-        settings=SETTINGS,
-    )
-    found = read_json(tmp_path / "metrics.json")["completion"]
-    assert found["objects"]["value"] == 1 and found["added_points"]["value"] == 1000
-    assert found["primitive_fitting_score"]["value"] > 0.95 > 0.5 > found["primitive_fitting_score_null"]["value"]
-    assert found["nue"]["value"] == pytest.approx(1.0, abs=0.15)
+def test_next_to_nothing_that_was_added_has_no_measures():
+    scene = np.random.default_rng(0).uniform(0, 4, (2000, 3)) * [1, 1, 0]
+    found = completion_metrics(Completion(scene, scene, scene[:3], 6.0), SETTINGS, 0)
+    assert found["nue"]["value"] is None and found["added_points"]["value"] == 3
 
 
 def test_every_part_of_what_was_added_counts_in_the_surface_variation():
@@ -256,7 +224,7 @@ def test_every_part_of_what_was_added_counts_in_the_surface_variation():
     rough = rng.uniform(0, 4, (1500, 3)) * [1, 1, 0.1] + [8.4, 0, 0]
     settings = replace(SETTINGS, primitive_most=2, sample=1500)
     found = [
-        completion_metrics([Completion(scene, scene, np.concatenate(parts), 10.0)], settings, 0)
+        completion_metrics(Completion(scene, scene, np.concatenate(parts), 10.0), settings, 0)
         for parts in ([smooth, rough], [rough, smooth])
     ]
     first, second = (f["surface_variation"]["value"] for f in found)

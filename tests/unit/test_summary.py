@@ -125,16 +125,6 @@ def test_completion_sets_value_null_before_and_after_side_by_side(results):
     assert table.loc[("house", "scene_f_score_05pct"), ["before", "after"]].tolist() == [0.4, 0.9]
 
 
-def test_the_completed_scene_has_its_metrics_beside_their_nulls(results):
-    found = {"nue": 0.9, "nue_null": 1.7, "surface_variation": 0.05, "surface_variation_after": 0.04}
-    write_json(
-        results / "scenes/demo/metrics.json", {"completion": {name: quantity(v, "1") for name, v in found.items()}}
-    )
-    names = ("house", "balloon")
-    row = read(summarise(results, names), "scenes").iloc[0]
-    assert {name: row[name] for name in found} == found
-
-
 def test_scores_against_truth_stand_at_their_thresholds(results):
     summary = summarise(results)
     objects = read(summary, "objects").set_index("object")

@@ -19,7 +19,7 @@ def results_of(wildcards):
         chunks = (
             [f"depth/{chunk}.json" for chunk in CHUNKS] if given == "photos" else []
         )
-        ends = ["dense.ply", "dense.json", "completed.json", "metrics.json"]
+        ends = ["dense.ply", "dense.json", "completed.json"]
         scenes[name] = [*SCENE_FILES[given], *chunks, *ends]
     for name, row in OBJECTS.items():
         objects[name] = [*OBJECT_FILES[what_is_given(row)], "object.ply"]
@@ -232,11 +232,11 @@ def run_anyway(job, options=""):
 
 
 def finish_scenes():
-    """Complete, draw, measure and show the scenes without the objects that failed. Where the scene itself failed, its figure, view
-    and metrics of before go: the page would show them as if they were of this run."""
+    """Complete, draw and show the scenes without the objects that failed. Where the scene itself failed, its figure and view of
+    before go: the page would show them as if they were of this run."""
     made = set()
     takes = {"complete_scene": failed_logs(), "draw_scene": ""}
-    for step in (*takes, "compute_scene_metrics", "view_scene"):
+    for step in (*takes, "view_scene"):
         for job in held_up(step):
             missing = [
                 other

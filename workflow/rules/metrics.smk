@@ -2,7 +2,6 @@
 #
 # INPUTS    everything before; config/scenes.tsv, config/objects.tsv: truth
 # OUTPUTS   results/objects/{object}/metrics.json, registration/{variant}/metrics.json
-#           results/scenes/{scene}/metrics.json
 #           results/scenes/{scene}/truth.json, results/objects/{object}/truth.json      only with truth
 
 
@@ -57,36 +56,6 @@ use rule compute_metrics as compute_variant_metrics with:
         "results/benchmarks/compute_variant_metrics/{object}-{variant}.tsv"
     message:
         "{wildcards.object}, variant {wildcards.variant}: metrics"
-
-
-rule compute_scene_metrics:
-    """Completion metrics of the completed scene, all its objects together (paper 3.3.2; G2 to G5)."""
-    input:
-        cloud="results/scenes/{scene}/completed.ply",
-        cloud_json="results/scenes/{scene}/completed.json",
-        crops=of_objects("registration/full/crop.ply"),
-        crops_json=of_objects("registration/full/crop.json"),
-    output:
-        "results/scenes/{scene}/metrics.json",
-    log:
-        "results/logs/compute_scene_metrics/{scene}.log",
-    benchmark:
-        "results/benchmarks/compute_scene_metrics/{scene}.tsv"
-    conda:
-        "../../envs/registration.yaml"
-    resources:
-        mem_mb=lambda wildcards, attempt: 6000 * attempt,
-        runtime=lambda wildcards, attempt: 60 * attempt,
-    params:
-        objects=object_folders,
-        seed=config["seed"],
-        script=script("metrics/compute_scene_metrics.py"),
-        code=code("metrics/compute_scene_metrics.py"),
-    message:
-        "Scene {wildcards.scene}: metrics"
-    shell:
-        "exec python {params.script} --completed {input.cloud} --completed-json {input.cloud_json} --objects {params.objects}"
-        " --report {output} --seed {params.seed} &> {log}"
 
 
 rule evaluate_scene:
