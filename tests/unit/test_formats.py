@@ -208,6 +208,8 @@ def test_where_colours_cannot_be_told_from_other_columns_there_are_none(tmp_path
         ("Northing,Easting,Elevation\nm,m,m", "{y},{x},{z}"),
         ("Northing (m)\tEasting (m)\tElevation (m)\tPoint Code", "{y}\t{x}\t{z}\ttree top"),
         ("Y coord\tX coord\tZ coord", "{y}\t{x}\t{z}"),
+        ("Norte;Este;Cota", "{y};{x};{z}"),
+        ("Est;Nord;Quota", "{x};{y};{z}"),
     ],
 )
 def test_columns_by_their_surveyors_names(tmp_path, header, row):

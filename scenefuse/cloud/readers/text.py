@@ -29,9 +29,9 @@ from scenefuse.core.stage import StageError
 
 TEXTS = (".xyz", ".pts", ".txt", ".asc", ".csv")
 # What surveyors call the columns, in lower case, and what may stand beside that.
-EASTING = ("x", "easting", "east", "e", "rechtswert", "rw", "ostwert")
-NORTHING = ("y", "northing", "north", "n", "hochwert", "hw", "nordwert")
-ELEVATION = ("z", "elevation", "elev", "height", "h", "altitude", "alt", "hoehe", "höhe")
+EASTING = ("x", "easting", "east", "e", "rechtswert", "rw", "ostwert", "ost", "est", "este")
+NORTHING = ("y", "northing", "north", "n", "hochwert", "hw", "nordwert", "nord", "norte")
+ELEVATION = ("z", "elevation", "elev", "height", "h", "altitude", "alt", "hoehe", "höhe", "quota", "cota")
 # Point, northing, easting, elevation and description, as surveyors' programs call a whole row.
 ROW_NAMES = re.compile("P?(NE|EN)ZD?", re.IGNORECASE)
 BESIDE = {"m", "utm", "coord", "coords", "coordinate"}
