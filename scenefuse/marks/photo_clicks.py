@@ -114,7 +114,7 @@ def clicks_per_photo(
         f"{clicks[0]} is in {place}" if len(clicks) == 1 else f"{len(clicks)} clicks, {clicks[0]} first, are in {place}"
         for place, clicks in lost.items()
     ]
-    clicked = {k: _of_photo(labels.path, views[k].name, clicks) for k, clicks in sorted(found.items())}
+    clicked = {k: of_photo(labels.path, views[k].name, clicks) for k, clicks in sorted(found.items())}
     if not any(clicks.prompt for clicks in clicked.values()):
         if left_out:
             raise StageError(
@@ -141,8 +141,8 @@ def _undistorted(
     return np.clip(np.where(np.isfinite(undistorted), undistorted, same_share), 0, whole - 1e-3)
 
 
-def _of_photo(path: Path, photo: str, clicks: list[tuple[Click, Array]]) -> PhotoClicks:
-    """The clicks of one photo with their undistorted pixels. Its two box corners are sorted."""
+def of_photo(path: Path, photo: str, clicks: list[tuple[Click, Array]]) -> PhotoClicks:
+    """The clicks of one photo with their pixels in a copy of it. Its two box corners are sorted."""
     corners = np.array([pixel for click, pixel in clicks if click.label == "box"]).reshape(-1, 2)
     if len(corners) not in (0, 2) or (len(corners) and (np.ptp(corners, axis=0) < 2).any()):
         raise StageError(f"{path}: a box in {photo} needs two lines, two opposite corners; there are {len(corners)}")

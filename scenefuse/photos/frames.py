@@ -16,13 +16,12 @@ from scenefuse.photos.photos import (
     Photo,
     below_folder,
     bits_to_stretch,
+    distinct_photos,
     each_photo,
     inspect_photo,
-    photo_names,
     photo_notes,
     save_upright,
     stays,
-    without_copies,
     write_photos,
 )
 from scenefuse.photos.pictures import write_picture
@@ -64,12 +63,12 @@ def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameS
         )
     with atomic_directory(frames) as temporary:
         kind = "video" if source.is_file() else "photos"
-        bits = 0
         if source.is_file():
             origin = _from_video(source, temporary, settings)
             listed = [inspect_photo(temporary, name) for name in sorted(origin)]
+            notes = photo_notes(listed, 0)
         else:
-            listed, origin, bits = _from_folder(source, temporary, settings)
+            listed, origin, notes = _from_folder(source, temporary, settings)
     if len(listed) < 3:
         shutil.rmtree(frames)
         advice = "lower object.frames.frame_step" if kind == "video" else "take more photos around the object"
@@ -77,13 +76,6 @@ def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameS
     print(f"{len(listed)} frames from {source}", flush=True)
     turned = {name: entry["orientation"] for name, entry in origin.items() if entry.get("orientation", 1) != 1}
     more = {"origin": quantity(origin, ""), "turned": quantity(turned, "")}
-    notes = photo_notes(listed, bits)
-    if kind == "photos":
-        distinct, copies = without_copies(source, photo_names(source))
-        if len(listed) < len(distinct):
-            used = f"{len(listed)} of {len(distinct)} photos are used, spread evenly"
-            notes.insert(0, f"{used} (object.frames.max_frames, frame_step)")
-        notes += copies + below_folder(distinct)
     write_photos(photos, listed, frames, kind, notes, **more)
 
 
@@ -104,9 +96,9 @@ def sharpness(frame: NDArray[Any]) -> float:
 
 def _from_folder(
     source: Path, output: Path, settings: FrameSettings
-) -> tuple[list[Photo], dict[str, dict[str, Any]], int]:
-    """The frames, what each was made of, and by how many bits their pixels were shifted."""
-    names, _ = without_copies(source, photo_names(source))
+) -> tuple[list[Photo], dict[str, dict[str, Any]], list[str]]:
+    """The frames, what each was made of, and notes."""
+    names, copies = distinct_photos(source)
     flat: dict[str, str] = {}
     for name in (names[i] for i in thin_out(len(names), settings.frame_step, settings.max_frames)):
         stem = Path(frame_name(name)).stem
@@ -129,7 +121,9 @@ def _from_folder(
     for photo, frame in zip(photos, frames):
         width, height = upright_size(source / photo.name)
         origin[frame.name] = {"source": photo.name, "width": width, "height": height, "orientation": photo.orientation}
-    return sorted(frames, key=lambda frame: frame.name), origin, bits
+    used = f"{len(frames)} of {len(names)} photos are used, spread evenly (object.frames.max_frames, frame_step)"
+    notes = [*([used] if len(frames) < len(names) else []), *photo_notes(frames, bits), *copies, *below_folder(names)]
+    return sorted(frames, key=lambda frame: frame.name), origin, notes
 
 
 def _from_video(source: Path, output: Path, settings: FrameSettings) -> dict[str, dict[str, Any]]:

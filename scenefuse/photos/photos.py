@@ -88,7 +88,7 @@ def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
     Raises:
         StageError: the folder is missing or holds no photo, a photo cannot be decoded, or geo.txt is not well formed.
     """
-    names, copies = without_copies(folder, photo_names(folder))
+    names, copies = distinct_photos(folder)
     geo = geo_file(folder)
     positions = read_geo(geo) if geo else {}
     stored = each_photo(lambda name: inspect_photo(folder, name), names)
@@ -113,8 +113,12 @@ def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
     write_photos(photos, listed, upright, kind="photos", notes=notes, turned=quantity(turned, ""))
 
 
-def photo_names(folder: Path) -> list[str]:
-    """Relative names of all photos below a folder, sorted; see `photo_files`.
+def distinct_photos(folder: Path) -> tuple[list[str], list[str]]:
+    """Relative names of the photos below a folder (`photo_files`), sorted, of which none is another's file again, byte
+    for byte; and notes that name pictures that were left out.
+
+    A copy sees nothing that its original does not, but would count as one more photo that confirms it. The shortest
+    name stays.
 
     Raises:
         StageError: what `photo_files` says; a name that holds control characters or undecodable bytes.
@@ -123,15 +127,6 @@ def photo_names(folder: Path) -> list[str]:
     odd = next((name for name in names if not name.isprintable()), None)
     if odd is not None:
         raise StageError(f"{odd!r} in {folder} has a name that lists and tables cannot hold; rename it")
-    return names
-
-
-def without_copies(folder: Path, names: list[str]) -> tuple[list[str], list[str]]:
-    """Photos of which none is another's file again, byte for byte, and notes that name pictures that were left out.
-
-    A copy sees nothing that its original does not, but would count as one more photo that confirms it. The shortest
-    name stays.
-    """
     beside = beside_photos(folder)
     of = "masks of photos by their names, or these photos in another format"
     notes = [f"{len(beside)} pictures are {of}, and are left out ({beside[0]}, ...)"] if beside else []

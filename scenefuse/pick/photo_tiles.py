@@ -67,7 +67,7 @@ class Picture:
         return (longitude + 180) / 360 * world, (1 - math.asinh(math.tan(math.radians(latitude))) / math.pi) / 2 * world
 
 
-def read_upright(path: Path, min_px: int | None = None) -> Pixels:
+def read_upright(path: Path, min_px: int) -> Pixels:
     """(H, W, 3) uint8 RGB of a photo as people see it.
 
     Args:
@@ -78,8 +78,7 @@ def read_upright(path: Path, min_px: int | None = None) -> Pixels:
         StageError: it cannot be read.
     """
     with open_picture(path) as stored:
-        if min_px is not None:
-            stored.draft("RGB", (min_px, min_px))
+        stored.draft("RGB", (min_px, min_px))
         image = ImageOps.exif_transpose(stored)
         # Sixteen-bit grey is not scaled by Pillow's conversion.
         if image.mode.startswith("I;16"):

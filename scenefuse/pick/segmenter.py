@@ -198,14 +198,8 @@ def lies_in_nothing(mask: Mask, clicks: Array, known: Array) -> bool:
 
 def _clicks_of(picture: Picture, rows: Rows, width: int, height: int) -> "PhotoClicks":
     """The clicks of one photo, in pixels of a copy of it of another size."""
-    from scenefuse.marks.photo_clicks import PhotoClicks
+    from scenefuse.marks.photo_clicks import of_photo
 
-    own = [row for row in rows if row.photo == picture.name]
     scale, edge = np.array([width / picture.width, height / picture.height]), np.array([width, height]) - 1e-3
-    points = [row for row in own if row.label != "box"]
-    original, corner = (
-        np.array([row.pixel for row in part]).reshape(-1, 2) for part in (points, [r for r in own if r.label == "box"])
-    )
-    at, box = (np.clip(pixels * scale, 0, edge) for pixels in (original, corner))
-    inside = np.array([row.label == "inside" for row in points], dtype=bool)
-    return PhotoClicks(at, inside, np.stack([box.min(0), box.max(0)]) if len(box) == 2 else None, original)
+    own = [(row, np.clip(row.pixel * scale, 0, edge)) for row in rows if row.photo == picture.name]
+    return of_photo(Path("the clicks"), picture.name, own)

@@ -10,7 +10,7 @@ from scenefuse.core.stage import StageError, read_json
 from scenefuse.crop.marked import MIN_INSIDE
 from scenefuse.marks.clicks import Kind
 from scenefuse.photos.photo_files import frame_name, thin_out, upright_size
-from scenefuse.photos.photos import photo_names, without_copies
+from scenefuse.photos.photos import distinct_photos
 from scenefuse.pick.document import (
     Corners,
     Document,
@@ -151,7 +151,7 @@ def _in_photos_of_scene(project: Project, name: str) -> Iterator[Table]:
     results = Path("results/scenes") / scene
     source = Path(project.scenes[scene]["photos"])
     # Those that the workflow turned upright are the same to a person.
-    pictures = _pictures((photo, source / photo) for photo in without_copies(source, photo_names(source))[0])
+    pictures = _pictures((photo, source / photo) for photo in distinct_photos(source)[0])
     where: dict[str, Any] = {"pictures": pictures, "models": (results / "georeferenced", results / "sparse")}
     made = Path("results/objects") / name / "fused.ply"
     yield Table(project, "objects", name, "fiducials", title="In the scene", result=made, **where)
@@ -171,7 +171,7 @@ def _object_pictures(source: Path, results: Path, frames: dict[str, Any]) -> dic
     """
     if source.is_file():
         return _video_pictures(source, results)
-    names, _ = without_copies(source, photo_names(source))
+    names, _ = distinct_photos(source)
     chosen = [names[k] for k in thin_out(len(names), frames["frame_step"], frames["max_frames"])]
     return _pictures((frame_name(name), source / name) for name in chosen)
 

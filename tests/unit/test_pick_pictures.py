@@ -69,7 +69,7 @@ def test_places_and_pixels_are_each_other_s_inverse_and_tiles_lie_where_they_bel
 def test_rotated_photos_stand_upright_and_sizes_are_as_people_see_them(tmp_path, orientation, turned, ending):
     pixels = stripes(90, 40)
     picture = saved(tmp_path / f"a.{ending}", pixels, orientation)
-    upright = read_upright(picture.path)
+    upright = read_upright(picture.path, 2000)
     assert (picture.height, picture.width) == upright.shape[:2]
     assert np.abs(upright.astype(int) - np.rot90(pixels, turned)).mean() < 4
 
@@ -77,12 +77,12 @@ def test_rotated_photos_stand_upright_and_sizes_are_as_people_see_them(tmp_path,
 def test_grey_and_sixteen_bit_photos_are_shown(tmp_path):
     ramp = np.linspace(0, 65535, 300).astype(np.uint16)[None].repeat(200, 0)
     cv2.imwrite(str(tmp_path / "a.png"), ramp)
-    assert abs(int(read_upright(tmp_path / "a.png")[100, 150, 1]) - 127) < 3
+    assert abs(int(read_upright(tmp_path / "a.png", 2000)[100, 150, 1]) - 127) < 3
 
 
 def test_a_broken_photo_is_named(tmp_path):
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8 no photo")
-    for reader in (upright_size, read_upright):
+    for reader in (upright_size, lambda path: read_upright(path, 2000)):
         with pytest.raises(StageError, match=r"broken\.jpg cannot be "):
             reader(tmp_path / "broken.jpg")
 

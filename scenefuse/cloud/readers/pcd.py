@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.readers.columns import Columns, check_count, next_rows, rows_behind, typed
-from scenefuse.core.stage import StageError
 
 
 @dataclass(frozen=True)
@@ -20,18 +19,14 @@ class _Header:
     """What a file says of its rows.
 
     Attributes:
-        names: of the fields.
-        types: of each field's numbers.
-        repeats: how many numbers each field has.
+        row: its fields by their names and types, each of one number or several.
         count: of rows.
         data: ascii, binary or binary_compressed.
         begin: the byte where the rows begin.
         lines: of the header.
     """
 
-    names: list[str]
-    types: list[np.dtype[Any]]
-    repeats: list[int]
+    row: np.dtype[Any]
     count: int
     data: str
     begin: int
@@ -39,10 +34,10 @@ class _Header:
 
 
 def read_pcd(path: Path, at_once: int) -> Iterator[Columns]:
-    """The columns of a PCD file, so many rows at a time; compressed ones are held whole.
+    """The columns of a PCD file that hold one number a row, so many rows at a time; compressed ones are held whole.
 
     Raises:
-        StageError: the file is cut short.
+        StageError: the file is cut short, or holds more points than its header counts.
         ValueError: it is no PCD, or damaged.
     """
     header = _header(path)
@@ -50,9 +45,13 @@ def read_pcd(path: Path, at_once: int) -> Iterator[Columns]:
     if read is None:
         raise ValueError(f"its DATA is '{header.data}'")
     count = 0
-    for arrays in read(path, header, at_once):
-        count += len(arrays[0])
-        yield _columns(header, arrays)
+    for fields in read(path, header, at_once):
+        count += len(fields[0])
+        yield {
+            name: values[:, 0]
+            for name, values in zip(header.row.names or (), fields)
+            if values.shape[1] == 1 and not name.startswith(" ")
+        }
     check_count(path, header.count, count)
 
 
@@ -69,6 +68,7 @@ def _header(path: Path) -> _Header:
                 raise ValueError("it has no PCD header")
         begin = file.tell()
     names = words.get("FIELDS", words.get("COLUMNS", []))  # as version 0.5 calls them
+    names = [f" {k}" if name == "_" else name for k, name in enumerate(names)]  # padding, often several times
     repeats = [int(n) for n in words.get("COUNT", ["1"] * len(names))]
     types = [np.dtype(f"<{kind.lower()}{size}") for kind, size in zip(words.get("TYPE", []), words.get("SIZE", []))]
     width, height = words.get("WIDTH", words.get("POINTS", ["0"])), words.get("HEIGHT", ["1"])
@@ -79,12 +79,14 @@ def _header(path: Path) -> _Header:
     there, odd = divmod(path.stat().st_size - begin, size)
     if data == "binary" and (there < count or not odd):
         check_count(path, count, there)
-    return _Header(names, types, repeats, count, data, begin, lines)
+    return _Header(np.dtype([(n, kind, (k,)) for n, kind, k in zip(names, types, repeats)]), count, data, begin, lines)
 
 
 def _lines(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
     """The fields (N, n) each of rows of text."""
-    left, line, ends = header.count, header.lines + 1, np.cumsum([0, *header.repeats])
+    left, line = header.count, header.lines + 1
+    kinds = [kind.subdtype or (kind, (1,)) for kind, *_ in (header.row.fields or {}).values()]
+    ends = np.cumsum([0, *(shape[0] for _, shape in kinds)])
     with open(path, "rb") as file:
         file.seek(header.begin)
         while left:
@@ -92,22 +94,21 @@ def _lines(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[A
             if not len(rows):
                 return
             left -= len(rows)
-            yield [typed(rows[:, at : at + n], kind) for at, n, kind in zip(ends, header.repeats, header.types)]
+            yield [typed(rows[:, at : at + n], kind) for at, (kind, (n,)) in zip(ends, kinds)]
         check_count(path, header.count, header.count + rows_behind(file, ends[-1]))
 
 
 def _rows(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
     """The same of binary rows."""
-    fields = [(str(k), kind, (n,)) for k, (kind, n) in enumerate(zip(header.types, header.repeats))]
-    row, left = np.dtype(fields), header.count
+    left = header.count
     with open(path, "rb") as file:
         file.seek(header.begin)
         while left:
-            rows = np.fromfile(file, row, min(at_once, left))
+            rows = np.fromfile(file, header.row, min(at_once, left))
             if not len(rows):
                 return
             left -= len(rows)
-            yield [np.ascontiguousarray(rows[name]) for name, *_ in fields]
+            yield [np.ascontiguousarray(rows[name]) for name in header.row.names or ()]
 
 
 def _compressed(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
@@ -116,24 +117,16 @@ def _compressed(path: Path, header: _Header, at_once: int) -> Iterator[list[NDAr
         file.seek(header.begin)
         packed, size = (int(number) for number in np.fromfile(file, "<u4", 2))
         content = file.read()[:packed]
-    if len(content) < packed:
-        raise StageError(f"{path} is cut short: {packed - len(content)} bytes are missing; copy it again")
+    check_count(path, packed, len(content), "bytes")
     # A copy of 264 bytes takes three.
-    if size > 88 * packed or size != header.count * sum(k.itemsize * n for k, n in zip(header.types, header.repeats)):
+    if size > 88 * packed or size != header.count * header.row.itemsize:
         raise ValueError("its compressed part is not as long as its header says")
-    raw = _lzf(content, size)
-    sizes = [kind.itemsize * n * header.count for kind, n in zip(header.types, header.repeats)]
-    arrays = [
-        np.frombuffer(raw, kind, header.count * n, at).reshape(header.count, n)
-        for kind, n, at in zip(header.types, header.repeats, np.cumsum([0, *sizes]))
-    ]
+    raw, fields, at = _lzf(content, size), [], 0
+    for kind, *_ in (header.row.fields or {}).values():
+        fields.append(np.ndarray(header.count, kind, raw, at))
+        at += kind.itemsize * header.count
     for first in range(0, header.count, at_once):
-        yield [array[first : first + at_once] for array in arrays]
-
-
-def _columns(header: _Header, arrays: list[NDArray[Any]]) -> Columns:
-    """Fields of one number by their names; padding is left out."""
-    return {name: array[:, 0] for name, array, n in zip(header.names, arrays, header.repeats) if n == 1 and name != "_"}
+        yield [values[first : first + at_once] for values in fields]
 
 
 def _lzf(packed: bytes, size: int) -> bytearray:
