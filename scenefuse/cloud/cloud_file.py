@@ -3,6 +3,7 @@ points that are none of a cloud: strays far from all others, and what scanners w
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -93,18 +94,31 @@ class FileSummary:
         """The rows of a part that are points of a surface."""
         return surface_rows(columns, self.is_las, self.without_zero)[0]
 
+    def cloud(self, surface: Columns) -> Cloud:
+        """Points of a surface, without what LAS says beside colours, and without colours where all are black."""
+        left_out = {*LAS_DIMENSIONS, WITHHELD} if self.is_las else set()
+        left_out |= set(COLOR) if self.white is None else set()
+        return cloud_of({name: values for name, values in surface.items() if name not in left_out}, self.white)
 
-def summarise(path: Path, parts: ColumnParts, look: Look) -> FileSummary:
+    def notes(self, points: Array, step: float) -> list[str]:
+        """What a user should know of the file; of (N, 3) points as dense as its own, which are so far apart."""
+        left_out = [f"{count} {why} of {self.path.name} were left out" for why, count in self.left_out.items() if count]
+        more = [*precision_note(self.path, self.sample, step), *coincidence_note(self.path, points)]
+        return [*left_out, *text_notes(self.path), *more]
+
+
+def summarise(path: Path, look: Look, degrees: bool = False) -> FileSummary:
     """Go through a file once.
 
     Args:
         path: of the file.
-        parts: its columns.
         look: called with each part.
+        degrees: whether it may be in degrees.
 
     Raises:
-        StageError: it is damaged, or holds no point of a surface.
+        StageError: it is missing, damaged, of an unknown ending, in degrees, or holds no point of a surface.
     """
+    parts = columns_in_parts(path, degrees)
     is_las, rows, count, zeros = path.suffix.lower() in ENDINGS, 0, 0, 0
     held, sample, left_out, white = list[Columns](), Thinned(SAMPLE), dict[str, int](), None
     bright = np.zeros(3, np.int64)
@@ -129,6 +143,9 @@ def summarise(path: Path, parts: ColumnParts, look: Look) -> FileSummary:
     if count == 0:
         said = ", ".join(f"{number} {why}" for why, number in left_out.items() if number)
         raise StageError(f"{path} holds no point of a surface ({said}); look at what wrote it, and give the surface")
+    chosen = chosen if len(chosen) else np.zeros((1, 3))
+    if not degrees:
+        check_not_degrees(path, chosen)
     if not bright.any() and is_las:
         white = None  # Formats with colours are used for points without, which are black then.
     return FileSummary(
@@ -138,7 +155,7 @@ def summarise(path: Path, parts: ColumnParts, look: Look) -> FileSummary:
         rows,
         count,
         left_out,
-        chosen if len(chosen) else np.zeros((1, 3)),
+        chosen,
         white,
         without_zero,
     )
@@ -193,14 +210,12 @@ class CloudFile:
         part: points of a surface in the box that was asked for.
         every: that part has every so manyth of them.
         last: greatest value of the field `source`; 0 where there is none.
-        notes: what a user should know of the file.
     """
 
     summary: FileSummary
     part: Cloud
     every: int
     last: int
-    notes: list[str]
 
     @classmethod
     def of(cls, path: Path, box: Box = EVERYWHERE, most: float = np.inf) -> "CloudFile":
@@ -221,16 +236,16 @@ class CloudFile:
             part.add(chosen_rows(surface, _inside(positions(surface), box))[0])
             last = max(last, int(np.nan_to_num(columns["source"]).max(initial=0)) if "source" in columns else 0)
 
-        whole = summarise(path, columns_in_parts(path), look)
-        check_not_degrees(path, whole.sample)
-        cloud = _cloud(surface_rows(part.columns, False, whole.without_zero)[0], whole)
-        notes = [*text_notes(path)]
-        notes += [f"{number} {why} of {path} are not used" for why, number in whole.left_out.items() if number]
-        found = cls(whole, cloud, part.every, last, notes)
-        notes += [*precision_note(path, cloud.points, found.spacing), *coincidence_note(path, cloud.points)]
-        return found
+        whole = summarise(path, look)
+        cloud = whole.cloud(surface_rows(part.columns, False, whole.without_zero)[0])
+        return cls(whole, cloud, part.every, last)
 
-    @property
+    @cached_property
+    def notes(self) -> list[str]:
+        """What a user should know of the file."""
+        return self.summary.notes(self.part.points, self.spacing)
+
+    @cached_property
     def spacing(self) -> float:
         """Median distance from a point of the part to its nearest neighbour, as if the part had all: on a surface, a
         quarter of the points lie twice as far apart."""
@@ -249,7 +264,7 @@ class CloudFile:
             first += len(columns["x"])
             chosen = self.summary.surface(numbered)
             rows = chosen.pop(ROW)
-            yield rows, _cloud(chosen, self.summary)
+            yield rows, self.summary.cloud(chosen)
 
     def near(self, low: Array, high: Array) -> tuple[Rows, Cloud]:
         """All points of a surface in the box from `low` (3,) to `high` (3,), and their rows (N,)."""
@@ -258,13 +273,6 @@ class CloudFile:
             inside = _inside(cloud.points, (low, high))
             found.append((rows[inside], cloud[inside]))
         return np.concatenate([rows for rows, _ in found]), concatenate([cloud for _, cloud in found])
-
-
-def _cloud(columns: Columns, whole: FileSummary) -> Cloud:
-    """Without what LAS says beside colours, and without colours where all are black."""
-    left_out = {*LAS_DIMENSIONS, WITHHELD} if whole.is_las else set()
-    left_out |= set(COLOR) if whole.white is None else set()
-    return cloud_of({name: values for name, values in columns.items() if name not in left_out}, whole.white)
 
 
 def _inside(points: Array, box: Box) -> NDArray[np.bool_]:

@@ -11,17 +11,13 @@ from scenefuse.cloud.cloud_file import STRAY_PERCENT, FileSummary, summarise, wi
 from scenefuse.cloud.clouds import (
     Cloud,
     cloud_of,
-    coincidence_note,
     concatenate,
     has_unit_normals,
-    precision_note,
     spacing,
     write_cloud,
 )
-from scenefuse.cloud.formats import check_not_degrees, columns_in_parts
 from scenefuse.cloud.readers.columns import Columns
 from scenefuse.cloud.readers.las import LAS_DIMENSIONS, WITHHELD, las_crs, las_dimensions
-from scenefuse.cloud.readers.text import text_notes
 from scenefuse.cloud.tiled_cloud import open_cloud, write_tiled
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Array, Sim3
@@ -52,7 +48,6 @@ def import_scene_cloud(
     """
     file = ImportedFile.of(source, LAS_DIMENSIONS)
     sample = file.summary.sample
-    check_not_degrees(source, sample)
     crs = crs_of(source, crs)
     unit, name = "scene units", None
     if crs is not None:
@@ -104,14 +99,12 @@ def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
         StageError: as of `import_scene_cloud`.
     """
     file = ImportedFile.of(source)
-    check_not_degrees(source, file.summary.sample)
     whole, notes = without_strays(concatenate(list(file.clouds())), source.name)
     origin = near_origin(whole.points)
     placed = replace(whole, points=whole.points - origin)
     write_cloud(cloud, placed)
     shift = Sim3(1.0, np.eye(3), -origin)
-    notes += coincidence_note(source, placed.points)
-    content = file.report(spacing(placed.points), placed.diagonal, "object units", notes)
+    content = file.report(placed.points, spacing(placed.points), placed.diagonal, "object units", notes)
     content["points"] = quantity(len(placed), "1")
     write_json(report, content | {"object_from_file": quantity(shift.matrix, "object units")})
 
@@ -164,7 +157,7 @@ class ImportedFile:
             if part.normals is not None:
                 unit_normals = unit_normals is not False and has_unit_normals(part)
 
-        whole = summarise(source, columns_in_parts(source, degrees), look)
+        whole = summarise(source, look, degrees)
         enough = len(np.unique(whole.sample[:, 0])) >= MIN_POINTS
         if not enough and (different := len(np.unique(whole.sample, axis=0))) < MIN_POINTS:
             raise StageError(
@@ -178,12 +171,11 @@ class ImportedFile:
     def clouds(self) -> Iterator[Cloud]:
         """The points in parts, with unit normals or none, colours as bytes or none, and only the fields kept."""
         for columns in self.summary.columns():
-            cloud = cloud_of(self.summary.surface(columns), self.summary.white)
-            normals = None
+            surface = self.summary.surface(columns)
+            cloud, normals = self.summary.cloud(surface), None
             if self.unit_normals and cloud.normals is not None:
                 normals = (cloud.normals / np.linalg.norm(cloud.normals, axis=1, keepdims=True)).astype(np.float32)
-            colors = None if self.summary.white is None else cloud.colors
-            yield Cloud(cloud.points, normals, colors, {name: cloud.fields[name] for name in self.kept})
+            yield replace(cloud, normals=normals, fields={name: surface[name] for name in self.kept})
 
     def write(self, cloud: Path, move: Callable[[Cloud], Cloud], unit: str) -> dict[str, Any]:
         """Write the points in another frame, tile by tile; the report of it.
@@ -199,21 +191,22 @@ class ImportedFile:
 
         write_tiled(cloud, placed, self.summary.count, move(Cloud(self.summary.sample)).points)
         tiles = open_cloud(cloud)
-        same = coincidence_note(self.summary.path, np.concatenate(tiles.samples()))
-        return self.report(tiles.spacing(), float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0))), unit, same)
+        diagonal = float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0)))
+        return self.report(np.concatenate(tiles.samples()), tiles.spacing(), diagonal, unit)
 
-    def report(self, step: float, diagonal: float, unit: str, more: Sequence[str] = ()) -> dict[str, Any]:
+    def report(
+        self, points: Array, step: float, diagonal: float, unit: str, more: Sequence[str] = ()
+    ) -> dict[str, Any]:
         """What was taken over, and what became of the rest; printed too.
 
         Args:
-            step: distance between neighbouring points.
+            points: (N, 3) some that were taken over, as dense as all.
+            step: distance between neighbouring ones.
             diagonal: of the points' box.
             unit: of both.
             more: further notes.
         """
-        source = self.summary.path
-        notes = [f"{count} {why} were left out" for why, count in self.summary.left_out.items() if count]
-        notes += [*more, *text_notes(source), *precision_note(source, self.summary.sample, step)]
+        notes = [*self.summary.notes(points, step), *more]
         if self.unit_normals is False:
             notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
         if self.unused:
@@ -224,7 +217,7 @@ class ImportedFile:
             "points": quantity(self.summary.count, "1"),
             "spacing": quantity(step, unit),
             "diagonal": quantity(diagonal, unit),
-            "source": quantity(source.name, ""),
+            "source": quantity(self.summary.path.name, ""),
             "columns_not_used": quantity(self.unused, ""),
             "notes": quantity(notes, ""),
         }

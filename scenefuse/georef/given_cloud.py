@@ -74,7 +74,7 @@ def import_posed_cloud(
         whole = way.apply(concatenate(list(file.clouds())))
         placed = whole if workspace is None or masks is None else _cut_out(whole, source, workspace, masks)
         write_cloud(cloud, placed)
-        content = file.report(spacing(placed.points), placed.diagonal, "object units")
+        content = file.report(placed.points, spacing(placed.points), placed.diagonal, "object units")
         content |= {"points": quantity(len(placed), "1"), "outside_masks": quantity(len(whole) - len(placed), "1")}
         similar = None if way.turned_alone else way.nearest.matrix
         content |= {"object_from_file": quantity(similar, "object units")}

@@ -177,7 +177,8 @@ def test_rows_without_a_position_and_unused_columns_are_recorded(tmp_path, cloud
     found, report, _ = imported_scene(tmp_path, tmp_path / "a.ply")
     assert len(found) == 497 and found.fields == {} and value(report, "columns_not_used") == ["intensity"]
     left_out, unused = value(report, "notes")
-    assert left_out == "3 rows without a finite position were left out" and unused.endswith("results: intensity")
+    assert left_out == "3 rows without a finite position of a.ply were left out"
+    assert unused.endswith("results: intensity")
 
 
 def test_normals_that_are_none_are_left_out_and_that_is_said(tmp_path, cloud):
@@ -209,15 +210,15 @@ def test_noise_of_a_laz_and_points_at_nothing_are_left_out_and_counted(tmp_path,
     found, report, _ = imported_scene(tmp_path, tmp_path / "noisy.laz")
     assert len(found) == 440 and value(report, "diagonal") < 100
     assert value(report, "notes")[:2] == [
-        "50 points of the classes 7 and 18 (noise) were left out",
-        "10 withheld points were left out",
+        "50 points of the classes 7 and 18 (noise) of noisy.laz were left out",
+        "10 withheld points of noisy.laz were left out",
     ]
     points = cloud.points.copy()
     points[:4] = 0
     write_cloud(tmp_path / "zero.ply", Cloud(points))
     found, report, _ = imported_scene(tmp_path, tmp_path / "zero.ply")
     assert len(found) == 496 and value(report, "diagonal") < 100
-    assert value(report, "notes") == ["4 points at exactly 0 0 0 were left out"]
+    assert value(report, "notes") == ["4 points at exactly 0 0 0 of zero.ply were left out"]
     near = cloud.points - UTM
     near[0] = 0
     write_cloud(tmp_path / "near.ply", Cloud(near))

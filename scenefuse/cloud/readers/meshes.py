@@ -8,6 +8,7 @@ import io
 import json
 import re
 from base64 import b64decode
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -196,66 +197,63 @@ def _ears(points: Array, normal: Array) -> NDArray[np.int64]:
     return np.array([*found, tuple(left)])
 
 
-@dataclass
-class _Obj:
-    """The lines of an OBJ file, rows from 0; `place` is -1 where a corner has no `vt`."""
-
-    vertices: list[list[float]] = field(default_factory=list)
-    uvs: list[list[float]] = field(default_factory=list)
-    polygons: list[list[int]] = field(default_factory=list)
-    places: list[list[int]] = field(default_factory=list)
-    used: list[str] = field(default_factory=list)
-    libraries: list[str] = field(default_factory=list)
-    material: str = ""
-
-    def take(self, line: str) -> None:
-        word, rest = (*line.split(None, 1), "", "")[:2]
-        numbers = rest.split("#")[0].split()
-        if word == "v":
-            self.vertices.append([float(cell) for cell in numbers])
-        elif word == "vt":
-            self.uvs.append([float(cell) for cell in [*numbers, "0"][:2]])
-        elif word == "f":
-            cells = [cell.split("/") for cell in numbers]
-            self.polygons.append([_row(cell[0], len(self.vertices)) for cell in cells])
-            self.places.append([_row(c[1], len(self.uvs)) if len(c) > 1 and c[1] else -1 for c in cells])
-            self.used.append(self.material)
-        elif word == "usemtl":
-            self.material = rest.strip()
-        elif word == "mtllib":
-            self.libraries.append(rest.strip())
-
-
 def read_obj(path: Path) -> Columns:
     """Wavefront OBJ: positions, colours behind them, polygons, pictures of the materials (`map_Kd`).
 
     Without faces its vertices are the points.
     """
-    content = _Obj()
+    vertices, uvs = list[list[float]](), list[list[float]]()
+    # Rows of `vertices` and of `uvs`, -1 where a corner has none of these.
+    polygons, places = list[list[int]](), list[list[int]]()
+    used, libraries, material = list[str](), list[str](), ""
+    for line in _obj_lines(path):
+        word, rest = (*line.split(None, 1), "", "")[:2]
+        numbers = rest.split("#")[0].split()
+        if word == "v":
+            vertices.append([float(cell) for cell in numbers])
+        elif word == "vt":
+            uvs.append([float(cell) for cell in [*numbers, "0"][:2]])
+        elif word == "f":
+            cells = [cell.split("/") for cell in numbers]
+            polygons.append([_row(cell[0], len(vertices)) for cell in cells])
+            places.append([_row(c[1], len(uvs)) if len(c) > 1 and c[1] else -1 for c in cells])
+            used.append(material)
+        elif word == "usemtl":
+            material = rest.strip()
+        elif word == "mtllib":
+            libraries.append(rest.strip())
+    if not vertices:
+        return {axis: np.empty(0) for axis in "xyz"}
+    width = 6 if min(map(len, vertices)) >= 6 else 3
+    table = np.array([vertex[:width] for vertex in vertices], np.float64)
+    colors = bytes_of(table[:, 3:]) if width == 6 else None
+    if not polygons:
+        columns: Columns = dict(zip("xyz", table[:, :3].T))
+        return columns if colors is None else columns | dict(zip(COLOR, colors.T))
+    rows, at = (np.fromiter(chain.from_iterable(some), np.int64) for some in (polygons, places))
+    corners, of = triangles(np.array(list(map(len, polygons))), rows, table[:, :3])
+    files = [file for name in libraries for file in _libraries(path.parent, name)]
+    known = dict(pair for file in files for pair in _materials(file).items())
+    names = sorted(set(used))
+    return sampled_columns(
+        Mesh(
+            table[:, :3],
+            rows[corners],
+            None if colors is None else colors.astype(np.float64),
+            np.array([*uvs, [np.nan, np.nan]], np.float64)[at[corners]],
+            np.array([names.index(name) for name in used])[of],
+            tuple(known.get(name, Material()) for name in names) if known else (),
+        )
+    )
+
+
+def _obj_lines(path: Path) -> Iterator[str]:
+    """The lines of an OBJ, those that a backslash continues in one."""
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         for line in file:
             while line.rstrip().endswith("\\") and (more := file.readline()):
                 line = line.rstrip()[:-1] + " " + more
-            content.take(line)
-    if not content.vertices:
-        return {axis: np.empty(0) for axis in "xyz"}
-    width = 6 if min(map(len, content.vertices)) >= 6 else 3
-    table = np.array([vertex[:width] for vertex in content.vertices], np.float64)
-    colors = bytes_of(table[:, 3:]) if width == 6 else None
-    if not content.polygons:
-        columns: Columns = dict(zip("xyz", table[:, :3].T))
-        return columns if colors is None else columns | dict(zip(COLOR, colors.T))
-    lengths = np.array([len(polygon) for polygon in content.polygons])
-    rows, places = (np.fromiter(chain.from_iterable(some), np.int64) for some in (content.polygons, content.places))
-    corners, of = triangles(lengths, rows, table[:, :3])
-    uvs = np.array([*content.uvs, [np.nan, np.nan]], np.float64)[places[corners]]
-    files = [file for name in content.libraries for file in _libraries(path.parent, name)]
-    known = dict(pair for file in files for pair in _materials(file).items())
-    names = sorted(set(content.used))
-    material = np.array([names.index(name) for name in content.used])[of]
-    materials = tuple(known.get(name, Material()) for name in names) if known else ()
-    painted = None if colors is None else colors.astype(np.float64)
-    return sampled_columns(Mesh(table[:, :3], rows[corners], painted, uvs, material, materials))
+            yield line
 
 
 def _row(cell: str, count: int) -> int:

@@ -201,14 +201,17 @@ class Place:
     def in_crs(self, x_in_model: Array) -> Array:
         """(N, 3) points among the cameras to (N, 3) easting or longitude, northing or latitude, height."""
         earth = self.earth_from_model.apply(x_in_model)
-        return self._crs_from_earth(earth) if self.geocentric else earth
+        if not self.geocentric:
+            return earth
+        return _through(self._projection(), _through(self._ellipsoid(), earth, "INVERSE"))
 
     def model_from(self, points: Array, crs: pyproj.CRS) -> Array:
         """The inverse, (N, 3) to (N, 3), of points in any CRS."""
         if crs != self.crs:
             points = _through(_best(crs, self.crs, f"{crs.name} and {self.crs.name}"), points)
-        earth = self._earth_from_crs(points) if self.geocentric else points
-        return self.earth_from_model.inverse().apply(earth)
+        if self.geocentric:
+            points = _through(self._ellipsoid(), _through(self._projection(), points, "INVERSE"))
+        return self.earth_from_model.inverse().apply(points)
 
     def wgs84(self, x_in_model: Array, where: str) -> Array:
         """(N, 3) points among the cameras to (N, 3) WGS84 latitude, longitude (deg), and height as the CRS counts it.
@@ -226,12 +229,6 @@ class Place:
         """What `read_place` reads again, as quantities."""
         content = (self.earth_from_model.matrix.tolist(), self.geocentric, self.crs.to_wkt())
         return {name: quantity(part, "") for name, part in zip(NAMES, content)}
-
-    def _crs_from_earth(self, earth: Array) -> Array:
-        return _through(self._projection(), _through(self._ellipsoid(), earth, "INVERSE"))
-
-    def _earth_from_crs(self, points: Array) -> Array:
-        return _through(self._ellipsoid(), _through(self._projection(), points, "INVERSE"))
 
     def _ellipsoid(self) -> pyproj.Transformer:
         """From longitude, latitude (deg) and height (m) on the CRS's own datum to metres about its centre."""
