@@ -395,6 +395,16 @@ def test_a_row_of_a_surveyor_that_one_word_names(tmp_path, name, right):
     assert right or any("left out; the next three are x, y and z" in note for note in read.notes)
 
 
+@pytest.mark.parametrize("nothing", [-9999, -32767, "-3.4028235e+38"])
+def test_cells_of_a_raster_that_hold_nothing_are_left_out_and_counted(tmp_path, nothing):
+    lines = rows()
+    lines[::4] = [f"{x} {y} {nothing}" for x, y, _ in GRID[::4]]
+    (tmp_path / "dem.xyz").write_text("\n".join(lines))
+    read = CloudFile.of(tmp_path / "dem.xyz")
+    assert len(read.part) == 30 and read.part.points[:, 2].min() >= 0
+    assert read.notes == ["10 rows without a finite position of dem.xyz were left out"]
+
+
 def test_coordinates_in_different_units_are_refused(tmp_path):
     (tmp_path / "a.csv").write_text("X [m],Y [m],Z [mm]\n" + "\n".join(rows(",")))
     with pytest.raises(StageError, match="has x, y and z in m, mm; export all three in one unit"):

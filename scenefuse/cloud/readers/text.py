@@ -48,6 +48,8 @@ MIN_CORRELATION_GAIN = 0.1
 MIN_RANGE_RATIO = 0.25
 # Rows or columns that no scanner's grid has more of; most coordinates in metres do.
 MAX_GRID_ROWS = 100_000
+# What GIS write for cells of a raster that hold nothing, or the largest of single numbers.
+NO_DATA = (-9999.0, -32767.0, -32768.0, -99999.0)
 # Lines in which the first row is looked for.
 MAX_HEAD_LINES = 50
 
@@ -187,7 +189,11 @@ def read_text(path: Path, at_once: int = AT_ONCE) -> Iterator[Columns]:
     lines, first, count = islice(_lines(path), layout.above, None), layout.above + 1, 0
     while some := list(islice(lines, at_once)):
         rows = layout.rows(path, some, first, list(layout.columns.values()))
-        yield dict(zip(layout.columns, rows.T))
+        columns = dict(zip(layout.columns, rows.T))
+        for axis in set(POSITION) & set(columns):
+            values = columns[axis]
+            values[np.isin(values, NO_DATA) | (np.abs(values) > 1e30)] = np.nan
+        yield columns
         first, count = first + len(some), count + len(rows)
     said = (int(line) for line in _lines(path) if line.strip().isdigit()) if path.suffix.lower() == ".pts" else ()
     if (missing := sum(said) - count) > 0:
