@@ -33,8 +33,8 @@ MIN_RECALL = 0.4
 MIN_COLOR = 0.5
 # The angle between the up directions: beyond that the pose is another one.
 MAX_TILT_DEG = DISTINCT_ANGLE_DEG
-# The share of the object in the scene's free space.
-MAX_FREE_SPACE_VIOLATION = 0.25
+# The share of the object in the scene's free space, and of the places that both clouds show at different depths.
+MAX_CONTRADICTED = 0.25
 # A motion maps an object onto itself when its colours agree as much, beside the share of its points that meet others.
 MIN_SELF_COLOR = 0.9
 
@@ -210,10 +210,10 @@ def _freely(axis: Array | None) -> str:
 def _reasons(best: Hypothesis, of_clouds: Iterable[str], problem: Problem) -> Iterator[str]:
     """Why a pose may not be used; free space and gravity count whatever decided on it."""
     violation, tilt = best.score.free_space_violation, tilt_deg(best.pose, problem.known.ups)
-    if violation is not None and violation > MAX_FREE_SPACE_VIOLATION:
+    if violation is not None and violation > MAX_CONTRADICTED:
         yield (
             f"{violation:.0%} of the object would lie in free space, where the scene's photos measured surfaces behind"
-            f" it; {MAX_FREE_SPACE_VIOLATION:.0%} are allowed"
+            f" it; {MAX_CONTRADICTED:.0%} are allowed"
         )
     yield from of_clouds
     if tilt is not None and tilt > MAX_TILT_DEG:
@@ -231,6 +231,11 @@ def _reasons_of_clouds(
         yield f"the object explains only {found.recall:.2f} of the scene crop, below {MIN_RECALL:.2f}"
     if found.color is not None and found.color < MIN_COLOR:
         yield f"the colours agree by {found.color:.2f} only, below {MIN_COLOR:.2f}"
+    if found.displaced is not None and found.displaced > MAX_CONTRADICTED:
+        yield (
+            f"in {found.displaced:.0%} of the places that both clouds show, one's surface lies in front of the other's;"
+            f" {MAX_CONTRADICTED:.0%} are allowed: the scene may show something else there"
+        )
     if repetition.undecided is not None:
         yield (
             f"the object repeats itself every {repetition.undecided:.3g} units of the scene, and shifted by that"

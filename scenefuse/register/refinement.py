@@ -12,7 +12,7 @@ from scenefuse.geometry.icp import refine_planes, refine_points
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare, with_grid, with_queries
 from scenefuse.register.coarse import Candidate
 from scenefuse.register.decision import (
-    MAX_FREE_SPACE_VIOLATION,
+    MAX_CONTRADICTED,
     DecidedBy,
     Decision,
     FineSettings,
@@ -24,7 +24,15 @@ from scenefuse.register.decision import (
 from scenefuse.register.likelihood import certified
 from scenefuse.register.problem import SURFACE_POINTS, Problem
 from scenefuse.register.repetition import multiples, shifted, shifts_onto_itself, undecided_shift
-from scenefuse.register.score import DISTINCT_ANGLE_DEG, DISTINCT_SHIFT, Hypothesis, Score, best_distinct, score
+from scenefuse.register.score import (
+    DISTINCT_ANGLE_DEG,
+    DISTINCT_SHIFT,
+    Hypothesis,
+    Score,
+    best_distinct,
+    displaced_share,
+    score,
+)
 from scenefuse.register.uncertainty import Uncertainty, common_error, with_bending
 
 # First pairing distance, as a share of the diagonal: of poses that differ by less, one finds the other.
@@ -90,7 +98,9 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
     # About a rough pose, whose axis is not exact, copies would slide past the rivals.
     polished = work.best_first([*polished, *(work.polish(h) for h in work.turned(polished[0]))])
     polished = work.best_first([*polished, *work.shifted(polished[0])])
-    ranked, uncertainty, decided_by = work.compared_with_photos(polished)
+    (best, *others), uncertainty, decided_by = work.compared_with_photos(polished)
+    displaced = displaced_share(*work.scored, best.pose, settings.score_fraction * problem.scene.diagonal)
+    ranked = [replace(best, score=replace(best.score, displaced=displaced)), *others]
     shape = with_queries(work.obj, SURFACE_POINTS // 10, problem.seed)
     decision = decide(ranked, uncertainty, decided_by, shape, work.problem, settings, work.repetition(ranked[0].pose))
     if decision.registered and decided_by in ("geometry", "near"):
@@ -290,7 +300,7 @@ def _mirrored(surface: Surface) -> Surface:
 def _refuted(h: Hypothesis) -> bool:
     """Whether a pose puts too much of the object where the scene's photos see something behind it."""
     violation = h.score.free_space_violation
-    return violation is not None and violation > MAX_FREE_SPACE_VIOLATION
+    return violation is not None and violation > MAX_CONTRADICTED
 
 
 def turned_copies(pose: Sim3, obj: Surface, up_in_scene: Array | None, steps: int) -> list[Sim3]:

@@ -22,6 +22,10 @@ MIN_MARGIN = 0.04
 # Poses that differ by less than these are one: an angle, the scale, the centre as a share of the diagonal.
 DISTINCT_ANGLE_DEG, DISTINCT_SCALE_LOG, DISTINCT_SHIFT = 8.0, 0.06, 0.05
 
+# Surfaces face the same way if the cosine of the angle between their normals is larger; and are sought within so many
+# times the distance of points that agree.
+MIN_FACING, LAYERS = 0.5, 6
+
 
 @dataclass(frozen=True)
 class Score:
@@ -37,6 +41,7 @@ class Score:
             None where the free space is not known.
         total: the number hypotheses are ranked by: F, with the object's area at the usual scale, times the agreement
             of colours, times the share outside free space.
+        displaced: see `displaced_share`; None where it was not measured.
     """
 
     f_score: float
@@ -45,6 +50,7 @@ class Score:
     color: float | None
     free_space_violation: float | None
     total: float
+    displaced: float | None = None
 
 
 def worth(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> tuple[Pairs, Array]:
@@ -100,6 +106,35 @@ def score(
     return Score(f_score, precision, recall, color, violation, total)
 
 
+def displaced_share(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> float | None:
+    """Share of the places shown by both clouds where one's surface lies in front of the other's, or behind it.
+
+    From each point the other cloud is looked up along the normal, both ways, for a surface that faces the same way:
+    where the object is, the two are one. None where no place is shown by both.
+
+    Args:
+        obj: the object in its own frame.
+        scene: the scene crop.
+        scene_from_object: the pose.
+        tau: distance within which surfaces are one, scene units; others are sought within LAYERS times that.
+    """
+    moved = obj.transformed(scene_from_object)
+    shown = apart = 0
+    for one, other in ((moved, scene), (scene, moved)):
+        places, normals = one.points[one.queries], one.normals[one.queries]
+        nearest = np.full(len(places), np.inf)
+        for step in range(-LAYERS, LAYERS + 1):
+            distance, index = other.tree.query(places + step * tau * normals, distance_upper_bound=tau)
+            hit = np.flatnonzero(np.isfinite(distance))
+            normal, found = normals[hit], index[hit]
+            facing = (other.normals[found] * normal).sum(1) > MIN_FACING
+            off = np.abs(((other.points[found] - places[hit]) * normal).sum(1))
+            nearest[hit] = np.minimum(nearest[hit], np.where(facing, off, np.inf))
+        shown += int(np.isfinite(nearest).sum())
+        apart += int((nearest[np.isfinite(nearest)] > tau).sum())
+    return apart / shown if shown else None
+
+
 def color_agreement(obj: Surface, scene: Surface, pairs: Pairs) -> float | None:
     """Correlation 0..1 of paired colours, pooled over channels, after a gain and a bias per channel.
 
@@ -139,6 +174,7 @@ class Hypothesis:
             "recall": self.score.recall,
             "color_agreement": self.score.color,
             "free_space_violation": self.score.free_space_violation,
+            "displaced_share": self.score.displaced,
         }
 
 

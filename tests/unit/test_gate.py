@@ -21,7 +21,14 @@ from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import Decision, FineSettings, Repetition, decide, unless_bent, unless_mirrored
 from scenefuse.register.problem import Alignment, Constraints, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
-from scenefuse.register.score import DISTINCT_ANGLE_DEG, DISTINCT_SCALE_LOG, DISTINCT_SHIFT, Hypothesis, Score
+from scenefuse.register.score import (
+    DISTINCT_ANGLE_DEG,
+    DISTINCT_SCALE_LOG,
+    DISTINCT_SHIFT,
+    Hypothesis,
+    Score,
+    displaced_share,
+)
 from scenefuse.register.uncertainty import Uncertainty
 
 X, Y, Z = np.eye(3)
@@ -148,8 +155,10 @@ CASES = [
     *sides("colours", "the colours agree by 0.50 only", gate.MIN_COLOR, decided_by=BY_CLOUDS,
            score=lambda v: {"color": v}),
     Case("no colours", None, {"color": None}),
-    *sides("free space", "25% of the object would lie in free space", most=gate.MAX_FREE_SPACE_VIOLATION,
+    *sides("free space", "25% of the object would lie in free space", most=gate.MAX_CONTRADICTED,
            score=lambda v: {"free_space_violation": v}),
+    *sides("displaced surfaces", "in 25% of the places that both clouds show", most=gate.MAX_CONTRADICTED,
+           decided_by=BY_CLOUDS, score=lambda v: {"displaced": v}),
     Case("unknown free space", None, {"free_space_violation": None}),
     Case("free space comes first", "free space", {"free_space_violation": 0.5, "f_score": 0.1}),
     Case("upright", None, ups=(Z, Z)),
@@ -347,6 +356,14 @@ def test_an_object_that_the_scene_does_not_have_is_refused(house):
     other = plant("sculpture", 7, ground=False, noise=0.005, object_points=3000, density_ratio=1.0).scene
     decision = registered(house.object, other, house.up_in_object).decision
     assert not decision.registered and ("F-score" in decision.reason or "explains" in decision.reason)
+
+
+def test_surfaces_that_lie_behind_each_other_are_displaced_and_those_that_meet_are_not():
+    """The oblong tower in the square one: its ends meet, its long sides lie 0.8 inside."""
+    tau, alone = 0.2, turn(X, 0)
+    assert displaced_share(OBLONG, OBLONG, alone, tau) == 0
+    assert displaced_share(SQUARE, OBLONG, alone, tau) == pytest.approx(0.5, abs=0.15)
+    assert displaced_share(OBLONG, SQUARE, shift(0, 50, 0), tau) is None
 
 
 def test_an_object_with_a_copy_beside_it_is_refused(house):

@@ -236,7 +236,7 @@ RULES = [
     Rule("gate: recall", f"{R}.decision.MIN_RECALL", constant(0.0)),
     Rule("gate: colours", f"{R}.decision.MIN_COLOR", constant(0.0)),
     Rule("gate: tilt", f"{R}.decision.MAX_TILT_DEG", constant(180.0)),
-    Rule("gate: free space", f"{R}.decision.MAX_FREE_SPACE_VIOLATION", constant(1.0)),
+    Rule("gate: free space", f"{R}.decision.MAX_CONTRADICTED", constant(1.0)),
     Rule("gate: margin", f"{HERE}.FineSettings", _setting(min_margin=0.0)),
     Rule("gate: uncertain scale", f"{HERE}.FineSettings", _setting(max_scale_sd_log=9.0)),
     Rule("gate: uncertain rotation", f"{HERE}.FineSettings", _setting(max_rotation_sd_deg=360.0)),
