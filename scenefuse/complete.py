@@ -226,7 +226,7 @@ def report_step(project: Path, line: str, started: float, cores: int) -> None:
     if FORECAST_LINE.fullmatch(line):
         print(line[0].upper() + line[1:], flush=True)
     elif job:
-        planned = read_forecast(project / "results/logs" / FORECAST, of_last_run=True)
+        planned = read_forecast(project / "results/logs" / FORECAST)
         left = duration(seconds_left(planned, project, started, cores))
         print(f"{time.strftime('%H:%M')} {job[1]}; about {left} left", flush=True)
 

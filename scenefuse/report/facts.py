@@ -5,7 +5,7 @@ The words are made of a row of scenes.tsv or objects.tsv, for the report page an
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from statistics import NormalDist
@@ -48,7 +48,7 @@ def object_facts(row: Row) -> dict[str, str]:
         facts["Size"] = f"{sides}, {length(has['height'], unit)} high"
     if "surface_missing" in has:
         lacks = {what: has.get(f"surface_{name}", 0.0) for name, what in WORDS["missing"].items()}
-        there, missing, *kinds = percents([1 - has["surface_missing"], *lacks.values()])
+        there, missing, *kinds = percents(list(lacks.values()))
         causes = ", ".join(f"{share} {what}" for what, share in zip(lacks, kinds) if share)
         facts["Surface"] = f"{there} is there" + (f", {missing} is missing: {causes}" if missing else "")
         if has.get("ground_missing"):
@@ -184,6 +184,13 @@ def _errors(what: str, horizontal_m: float, vertical_m: float) -> list[str]:
     le90 = length(NormalDist().inv_cdf(0.95) * vertical_m, "m")
     rms = f"{length(horizontal_m, 'm')} horizontally and {length(vertical_m, 'm')} vertically"
     return [f"{what} {rms} off (root mean square)", f"nine of ten less than {ce90} (CE90) and {le90} (LE90)"]
+
+
+def rows_of(summary: Path, kind: str, folders: Sequence[Path]) -> list[dict[str, Any]]:
+    """The rows of scenes.tsv or objects.tsv of some folders of results; of one that has none, that it is missing."""
+    known = {row[kind]: row for row in records(read_table(summary / f"{kind}s.tsv"))}
+    missing = {"status": "missing"} if kind == "object" else {"error": "not run yet"}
+    return [known.get(folder.name, {kind: folder.name, **missing}) for folder in folders]
 
 
 def made_by(summary: Path) -> str:

@@ -102,8 +102,8 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
 
     Writes before_after.png (the surroundings before and after fusion from four sides and from below), before.png and
     after.png (one large view of each, the side that changed most), missing.png (what is still missing, and from where
-    photos would show it) and object.png (frames, masks, depth of the four stages, renders, the object's cloud, alone
-    where it was given); of a fused object view.ply and view.json too, for the 3D view of the report page.
+    photos would show it) and object.png (depth of the four stages, renders, the object's cloud, alone where it was
+    given); of a fused object view.ply and view.json too, for the 3D view of the report page.
 
     Args:
         inputs: see FigureInputs.
@@ -234,8 +234,8 @@ def _rgb(color: str) -> Array:
 def _object_sheet(
     name: str, cloud: Cloud, workspace: Path | None, masks: Path | None, stages: tuple[Path, ...]
 ) -> Figure:
-    """Frames, masks, depth of each stage on one scale, renders, the cloud from four sides (Figure 3); the cloud alone
-    of an object that was given as one."""
+    """Depth of each stage on one scale, renders beside photos, the cloud from four sides (Figure 3); the cloud alone of
+    an object that was given as one."""
     title, sides = f"{name}: the object by itself", _sides(cloud, inner(cloud.points), point_radii(cloud.points))
     if workspace is None or masks is None or not stages:
         note = (
@@ -245,20 +245,9 @@ def _object_sheet(
     photos = sorted(p for p in (workspace / "images").iterdir() if (masks / f"{p.stem}.png").is_file())
     if not photos:
         raise StageError(f"no photo in {workspace}/images has a mask in {masks}; rerun the masks stage")
-    chosen = [photos[i] for i in np.linspace(0, len(photos) - 1, len(SIDES_DEG)).round().astype(int)]
-    frames = [(p.name, read_rgb(p)) for p in chosen]
-    cut_out: list[Cell] = [
-        ("", _dim_outside(frame, read_mask(masks / f"{p.stem}.png"))) for (_, frame), p in zip(frames, chosen)
-    ]
-    rows: list[Sequence[Cell]] = [
-        frames,
-        cut_out,
-        _depth_row(photos, masks, stages),
-        _render_row(photos, stages[-1]),
-        sides,
-    ]
+    rows: list[Sequence[Cell]] = [_depth_row(photos, masks, stages), _render_row(photos, stages[-1]), sides]
     note = f"{len(photos)} frames with masks; cloud of {len(cloud):,} points; one depth scale, near bright, far dark"
-    return draw_sheet(title, note, rows, labels=["frames", "masks", "depth", "renders", "cloud"])
+    return draw_sheet(title, note, rows, labels=["depth", "renders", "cloud"])
 
 
 def _sides(cloud: Cloud, framed: Array, radii: ArrayLike) -> list[Cell]:
@@ -295,12 +284,6 @@ def _fit(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """The mask at another size."""
     size = (shape[1], shape[0])
     return np.asarray(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
-
-
-def _dim_outside(picture: Image, mask: NDArray[np.bool_]) -> Image:
-    """The picture with everything outside the mask faded to a pale grey."""
-    pale = 235 - (235 - picture.astype(np.float32)) * 0.12
-    return np.where(_fit(mask, picture.shape)[..., None], picture, pale).astype(np.uint8)
 
 
 def upright(cloud: Cloud, workspace: Path) -> Cloud:

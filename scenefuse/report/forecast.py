@@ -12,7 +12,7 @@ from PIL.ExifTags import IFD
 
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.photos.photo_files import open_picture, photo_files, upright_size
-from scenefuse.report.values import parts_of, size_text
+from scenefuse.report.values import bytes_in, size_text
 from scenefuse.sfm.matches import MatchSettings
 
 # Bytes that a feature takes in both databases of a model, with its matches; a pixel of a photo in its copies as JPEG; a
@@ -38,7 +38,7 @@ IDLE_FACTOR = 1.15
 # A forecast is right within this factor: what is short by more cannot do.
 ERROR_FACTOR = 1.5
 # Its file in the folder of logs, and columns.
-FORECAST, COLUMNS = "forecast.tsv", ["benchmark", "seconds", "last_run"]
+FORECAST, COLUMNS = "forecast.tsv", ["benchmark", "seconds"]
 
 
 @dataclass(frozen=True)
@@ -191,14 +191,12 @@ def _disk(needed: Mapping[Path, int | None], keep_maps: bool) -> list[str]:
     if not known:
         return []
     there = next(path for path in next(iter(known)).absolute().parents if path.exists())
-    taken = {folder: sum(parts_of(folder).values()) for folder in known}
+    taken = {folder: bytes_in(folder) for folder in known}
     free, more = shutil.disk_usage(there).free, sum(max(0, size - taken[folder]) for folder, size in known.items())
-    unknown = [folder.name for folder in needed if folder not in known]
     amount = "about" if keep_maps else "less than, as maps go (keep_maps: false),"
     line = (
         f"disk: scenes and objects will take {amount} {size_text(sum(known.values()))}"
         f" ({size_text(sum(taken.values()))} now), {size_text(free)} are free"
-        + (f"; not counted: {', '.join(unknown)}" if unknown else "")
     )
     advice = "free some space, or set `keep_maps: false`" if keep_maps else "free some space, or run fewer at a time"
     if more > free * ERROR_FACTOR and keep_maps:
@@ -213,18 +211,17 @@ def duration(seconds: float) -> str:
 
 
 def write_forecast(path: Path, seconds: Mapping[str, float]) -> None:
-    """Write the seconds that the jobs of a run will take, by their benchmark's file; those of jobs before stay."""
-    earlier = read_forecast(path)
+    """Write the seconds that the jobs of a run will take, by their benchmark's file."""
     with atomic_file(path) as temporary:
-        rows = [(name, cost, int(name in seconds)) for name, cost in sorted((earlier | dict(seconds)).items())]
-        pd.DataFrame(rows, columns=COLUMNS).to_csv(temporary, sep="\t", index=False, float_format="%.1f")
+        pd.DataFrame(sorted(seconds.items()), columns=COLUMNS).to_csv(
+            temporary, sep="\t", index=False, float_format="%.1f"
+        )
 
 
-def read_forecast(path: Path, of_last_run: bool = False) -> dict[str, float]:
-    """What `write_forecast` wrote, or its jobs of the last run; empty where nothing is, or nothing that can be read."""
+def read_forecast(path: Path) -> dict[str, float]:
+    """What `write_forecast` wrote; empty where nothing is, or nothing that can be read."""
     try:
         table = pd.read_csv(path, sep="\t")
-        table = table[table[COLUMNS[2]] == 1] if of_last_run else table
         return dict(zip(table[COLUMNS[0]].astype(str), table[COLUMNS[1]].astype(float)))
     except (OSError, ValueError, KeyError):
         return {}

@@ -140,7 +140,6 @@ def render(
     camera: Camera,
     radii: ArrayLike,
     colors: ArrayLike | None = None,
-    background: tuple[int, int, int] = (255, 255, 255),
     eye_dome: float = 0.8,
 ) -> Image:
     """Draw a cloud as (H, W, 3) uint8 RGB.
@@ -149,8 +148,7 @@ def render(
         cloud: N points; normals are used for the head light when there are any.
         camera: where from.
         radii: (N,) disc radii in the cloud's unit, or one number for all (`point_radii`).
-        colors: (N, 3) uint8 instead of the cloud's own colours; grey where there are none.
-        background: RGB of empty pixels.
+        colors: (N, 3) uint8, or one RGB, instead of the cloud's own colours; grey where there are none.
         eye_dome: strength of the dark rims at depth steps, 0 for none.
     """
     fine = replace(
@@ -159,7 +157,8 @@ def render(
         width_px=camera.width_px * SUPERSAMPLING,
         height_px=camera.height_px * SUPERSAMPLING,
     )
-    rgb = _base_colors(cloud, colors) * _head_light(cloud, camera)[:, None]
+    chosen = next((given for given in (colors, cloud.colors) if given is not None), (165, 165, 165))
+    rgb = np.broadcast_to(np.asarray(chosen, np.float32), (len(cloud), 3)) * _head_light(cloud, camera)[:, None]
     pixels, depth = fine.project(cloud.points)
     slopes = _slopes(cloud, fine, pixels)
     radius = np.broadcast_to(np.asarray(radii, dtype=np.float32), (len(cloud),))
@@ -184,15 +183,9 @@ def render(
         low, high = np.percentile(surface[covered], [2, 98])
         step = np.float32(max(high - low, 1e-6) * 0.02)
         picture *= _eye_dome(surface, 1.2 * size, step, np.float32(eye_dome))[..., None]
-    picture[~covered] = np.asarray(background, dtype=np.float32)
+    picture[~covered] = 255
     shape = (camera.height_px, SUPERSAMPLING, camera.width_px, SUPERSAMPLING, 3)
     return np.clip(picture.reshape(shape).mean((1, 3)) + 0.5, 0, 255).astype(np.uint8)
-
-
-def _base_colors(cloud: Cloud, colors: ArrayLike | None) -> NDArray[np.float32]:
-    """(N, 3) float32 colours 0 to 255: those given (one RGB or N), else the cloud's, else grey."""
-    chosen = colors if colors is not None else cloud.colors if cloud.colors is not None else (165, 165, 165)
-    return np.broadcast_to(np.asarray(chosen, dtype=np.float32), (len(cloud), 3))
 
 
 def _head_light(cloud: Cloud, camera: Camera) -> NDArray[np.float32]:

@@ -1,9 +1,9 @@
 """What stages left, which may lack anything: quantities as one flat table, sizes on the disk, numbers as short text."""
 
+import contextlib
 import importlib.resources
 import json
 import math
-import os
 import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -61,25 +61,13 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def find(fields: Fields, *names: str) -> Any:
-    """The value of the first of `names` that is there: by full name, else by the last part of a name; else None."""
-    found = _field(fields, names)
-    return None if found is None else found["value"]
+    """The value of the first of `names` that is there; else None."""
+    return next((fields[name]["value"] for name in names if name in fields), None)
 
 
 def unit_of(fields: Fields, *names: str) -> str | None:
     """The unit of what `find` finds; None when there is nothing."""
-    found = _field(fields, names)
-    return None if found is None else str(found["unit"])
-
-
-def _field(fields: Fields, names: tuple[str, ...]) -> dict[str, Any] | None:
-    for name in names:
-        if name in fields:
-            return fields[name]
-        for key, item in fields.items():
-            if "." not in name and key.rsplit(".", 1)[-1] == name:
-                return item
-    return None
+    return next((str(fields[name]["unit"]) for name in names if name in fields), None)
 
 
 def number(item: Any) -> str:
@@ -103,16 +91,11 @@ def percent(share: float) -> str:
     return f"{value:.{digits}f} %"
 
 
-def percents(parts: Sequence[float]) -> list[str]:
-    """The first share of a whole, the sum of the others, and these, in per cent that sum to 100; "" for none."""
-    digits = 1 if sum(parts[1:]) >= 0.001 else 2
-    whole = 10 ** (digits + 2)
-    exact = [whole * part / (sum(parts) or 1.0) for part in parts]
-    counts = [math.floor(part) for part in exact]
-    # What rounding down leaves goes to the largest remainders.
-    for at in sorted(range(len(parts)), key=lambda at: counts[at] - exact[at])[: whole - sum(counts)]:
-        counts[at] += 1
-    return [f"{100 * n / whole:.{digits}f} %" if n else "" for n in (counts[0], sum(counts[1:]), *counts[1:])]
+def percents(missing: Sequence[float]) -> list[str]:
+    """What some shares leave of a whole, what they take together, and each: per cent that sum to 100, "" for none."""
+    digits = 1 if sum(missing) >= 0.001 else 2
+    each = [round(100 * share, digits) for share in missing]
+    return [f"{part:.{digits}f} %" if part else "" for part in (100 - sum(each), sum(each), *each)]
 
 
 def length(value: float, unit: str) -> str:
@@ -123,22 +106,16 @@ def length(value: float, unit: str) -> str:
     return f"{digits} {unit}"
 
 
-def parts_of(folder: Path) -> dict[str, int]:
-    """Bytes of the files in a folder, and of those below each folder in it; links take none. Temporary files of
-    running jobs are left out."""
-    parts: dict[str, int] = {}
-    for place, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if TEMPORARY not in name]
-        below = Path(place).relative_to(folder).parts
-        for name in names:
-            try:
-                status = os.lstat(os.path.join(place, name))
-            except OSError:
-                continue
-            if TEMPORARY not in name and not stat.S_ISLNK(status.st_mode):
-                part = below[0] if below else name
-                parts[part] = parts.get(part, 0) + status.st_size
-    return parts
+def bytes_in(folder: Path) -> int:
+    """Bytes of the files in and below a folder; links and the temporary files of running jobs are left out."""
+    files = (path for path in folder.rglob("*") if TEMPORARY not in path.relative_to(folder).as_posix())
+    size = 0
+    for path in files:
+        # A job that runs meanwhile takes files away.
+        with contextlib.suppress(OSError):
+            status = path.lstat()
+            size += status.st_size if stat.S_ISREG(status.st_mode) else 0
+    return size
 
 
 def size_text(size: float) -> str:

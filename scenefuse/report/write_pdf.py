@@ -12,8 +12,8 @@ from PIL import Image
 
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.version import VERSION
-from scenefuse.report.facts import made_by, object_facts, scene_facts, surface_facts
-from scenefuse.report.values import WORDS, length, read_table, records
+from scenefuse.report.facts import made_by, object_facts, rows_of, scene_facts, surface_facts
+from scenefuse.report.values import WORDS, length
 from scenefuse.surface.gltf import metres_per_unit
 
 GAP_MM = 4
@@ -32,16 +32,13 @@ def write_pdf(
         title: of the project; the working directory's name where it is left out.
         report: output PDF.
     """
-    of_object, of_scene = (
-        {row[kind]: row for row in records(read_table(summary / f"{kind}s.tsv"))} for kind in ("object", "scene")
-    )
-    rows = [of_object.get(folder.name, {"object": folder.name, "status": "missing"}) for folder in objects]
+    rows = rows_of(summary, "object", objects)
     facts = [object_facts(row) | surface_facts(folder, row.get("unit", "m")) for folder, row in zip(objects, rows)]
     page = _Page(title or Path.cwd().name, made_by(summary))
     page.start(page.project, page.made)
-    for folder in scenes:
-        page.text_line(f"Scene {folder.name}", 12)
-        page.facts(scene_facts(of_scene.get(folder.name, {"error": "not run yet"})))
+    for row in rows_of(summary, "scene", scenes):
+        page.text_line(f"Scene {row['scene']}", 12)
+        page.facts(scene_facts(row))
     page.text_line("Objects", 12)
     verdicts = [WORDS["badges"].get(row["status"], row["status"]) for row in rows]
     found = [[each.get("Size", "-"), shorten(each.get("Surface", each["Result"]).split(";")[0], 150)] for each in facts]

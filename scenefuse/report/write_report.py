@@ -11,10 +11,10 @@ import pandas as pd
 import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.report.facts import made_by, object_facts, scene_facts, surface_facts
+from scenefuse.report.facts import made_by, object_facts, rows_of, scene_facts, surface_facts
 from scenefuse.report.page import document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
-from scenefuse.report.values import WORDS, asset, number, read_table, records
+from scenefuse.report.values import WORDS, asset, number, read_table
 from scenefuse.report.view import View, read_view, thin
 from scenefuse.report.view_mesh import read_mesh
 
@@ -55,14 +55,10 @@ def write_report(
     if not (summary / "summary.txt").is_file():
         raise StageError(f"{summary / 'summary.txt'} does not exist; write the summary first")
     texts: Texts = yaml.safe_load(asset("report.yaml"))
-    title = title or Path.cwd().name
+    title, papers = title or Path.cwd().name, [] if paper is None else [paper]
     views = _views([*(folder / "figures" for folder in objects), *scenes])
     tables = {name: table for name in texts["tables"] if len(table := read_table(summary / f"{name}.tsv"))}
-    of_object, of_scene = (
-        {row[kind]: row for row in records(tables.get(f"{kind}s", pd.DataFrame()))} for kind in ("object", "scene")
-    )
-    rows = [of_object.get(folder.name, {"object": folder.name, "status": "missing"}) for folder in objects]
-    shown = list(zip(objects, rows))
+    shown = list(zip(objects, rows_of(summary, "object", objects)))
     links = "".join(
         f'<span><a href="#{escape(folder.name)}">{escape(folder.name)}</a>{_badge(row)}</span>' for folder, row in shown
     )
@@ -70,21 +66,18 @@ def write_report(
         f"<header><h1>{escape(title)}</h1><p>{escape(made_by(summary))} {texts['intro']}</p>",
         f"<nav>{links}</nav></header>",
         *(
-            f'<section class="scene"><h2>Scene {escape(name)}</h2>{_facts(scene_facts(of_scene[name]))}</section>'
-            for name in (folder.name for folder in scenes)
-            if name in of_scene
+            f'<section class="scene"><h2>Scene {escape(row["scene"])}</h2>{_facts(scene_facts(row))}</section>'
+            for row in rows_of(summary, "scene", scenes)
         ),
         *(_object_card(folder, row, views.get(folder / "figures"), texts) for folder, row in shown),
         *(_scene_card(folder, views.get(folder), texts) for folder in scenes if (folder / "scene.png").is_file()),
         '<section id="record"><h2>For the record</h2>',
         *(_object_record(folder, texts) for folder, row in shown if row["status"] not in UNFINISHED),
-        *([] if paper is None else [_folded("The paper", _paper_section(paper), "compared")]),
-        *(_table_section(name, table, **texts["tables"][name]) for name, table in tables.items()),
+        *(_folded("The paper", p.read_text("utf-8") if p.is_file() else texts["no_paper"]) for p in papers),
+        *(_table_section(table, **texts["tables"][name]) for name, table in tables.items()),
     ]
-    if (summary / "details.txt").is_file():
-        body.append(
-            _folded("Details", f"<pre>{escape((summary / 'details.txt').read_text().strip())}</pre>", "details")
-        )
+    if (details := summary / "details.txt").is_file():
+        body.append(_folded("Details", f"<pre>{escape(details.read_text().strip())}</pre>"))
     body.append("</section>")
     page = document(title, body, bool(views))
     with atomic_file(report) as temporary:
@@ -111,9 +104,9 @@ def _facts(facts: dict[str, str]) -> str:
     return f"<dl>{''.join(f'<div><dt>{k}</dt><dd>{text}</dd></div>' for k, text in linked.items())}</dl>"
 
 
-def _folded(title: str, content: str, key: str) -> str:
+def _folded(title: str, content: str) -> str:
     """What is shown when its title is pressed."""
-    return f'<details id="{escape(key)}"><summary>{escape(title)}</summary>{content}</details>'
+    return f"<details><summary>{escape(title)}</summary>{content}</details>"
 
 
 def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str:
@@ -130,12 +123,9 @@ def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str
     elif status in texts["no_view"]:
         parts.append(f"<p>{texts['no_view'][status]}</p>")
     if is_finished and (figures / "missing.png").is_file():
-        parts.append(
-            _folded("What is missing", figure(figures / "missing.png", texts["missing"]), f"{folder.name}-missing")
-        )
-    if (folder / "masks.png").is_file():
-        content = figure(folder / "masks.png", texts["masks"])
-        parts.append(_folded("What was taken for the object in its photos", content, f"{folder.name}-masks"))
+        parts.append(_folded("What is missing", figure(figures / "missing.png", texts["missing"])))
+    if (masks := folder / "masks.png").is_file():
+        parts.append(_folded("What was taken for the object in its photos", figure(masks, texts["masks"])))
     return "\n".join([*parts, "</section>"])
 
 
@@ -168,21 +158,14 @@ def _object_record(folder: Path, texts: Texts) -> str:
     """The figures of an object that say how its result came about."""
     figures = {folder / name: caption for name, caption in texts["object_figures"].items()}
     shown = "".join(figure(path, caption) for path, caption in figures.items() if path.is_file())
-    return _folded(f"Figures of {folder.name}", shown, f"{folder.name}-record") if shown else ""
+    return _folded(f"Figures of {folder.name}", shown) if shown else ""
 
 
-def _paper_section(path: Path) -> str:
-    """The section of the paper as it was written, or that it is missing."""
-    if path.is_file():
-        return path.read_text(encoding="utf-8")
-    return f"<p>{path.name} is missing; results/logs/compare_with_paper/ says why.</p>"
-
-
-def _table_section(name: str, table: pd.DataFrame, title: str, note: str, turned: bool = False) -> str:
+def _table_section(table: pd.DataFrame, title: str, note: str, turned: bool = False) -> str:
     """A table with its note; empty columns are left out; `turned` has a row for each column."""
     table = table.dropna(axis=1, how="all")
     if turned:
         table = table.set_index(table.columns[0]).T.rename_axis(columns=None).reset_index(names="")
     cells = table.map(lambda cell: number(cell) if cell == cell else "-")
     content = cells.to_html(index=False, border=0).replace("_", "_<wbr>")
-    return _folded(title, f'<p>{escape(note)}</p><div class="wide">{content}</div>', f"table-{name}")
+    return _folded(title, f'<p>{escape(note)}</p><div class="wide">{content}</div>')

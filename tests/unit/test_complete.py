@@ -13,7 +13,7 @@ from scenefuse.core.settings import read_differences
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_table
 from scenefuse.new_project import init
-from scenefuse.report.forecast import read_forecast, seconds_left, write_forecast
+from scenefuse.report.forecast import seconds_left
 
 SUMMARY = """
 import pathlib
@@ -207,12 +207,6 @@ def test_the_time_left_follows_what_jobs_took_so_far(tmp_path):
     os.utime(tmp_path / "b.tsv", (50, 50))  # of a run before
     # One of four is done and took three times its forecast, so that all takes half as long again.
     assert seconds_left(forecast, tmp_path, 100, 2) == pytest.approx(1.15 * 1.5 * 300 / 2)
-
-
-def test_the_forecast_of_the_last_run_is_told_apart(tmp_path):
-    write_forecast(tmp_path / "f.tsv", {"a": 1.0})
-    write_forecast(tmp_path / "f.tsv", {"b": 2.0})
-    assert read_forecast(tmp_path / "f.tsv", of_last_run=True) == {"b": 2.0}
 
 
 def started(monkeypatch, *words: str) -> list[str]:
