@@ -296,6 +296,7 @@ def test_everything_is_named_and_reached_by_the_keyboard(opened):
     assert changed(opened.picture(STAGE), first) > 0.05
 
 
+@pytest.mark.process
 def test_a_phone_shows_turns_and_measures_without_scrolling_sideways(page):
     with chromium(phone=True) as phone:
         phone.open(page)
@@ -360,6 +361,7 @@ return found;
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(("phone", "screens"), [(False, 2), (True, 3)])
 def test_a_clients_questions_are_answered_by_the_first_screens(tmp_path, phone, screens):
     page = report(tmp_path, {"house": None})
@@ -387,6 +389,7 @@ def test_a_clients_questions_are_answered_by_the_first_screens(tmp_path, phone, 
     assert [question for question, answer in QUESTIONS.items() if not re.search(answer, said, re.IGNORECASE)] == []
 
 
+@pytest.mark.process
 def test_a_browser_without_webgl_says_so(page):
     with chromium("--disable-gpu", "--disable-3d-apis") as old:
         old.open(page)

@@ -348,6 +348,7 @@ def test_a_refusal_ends_in_places_whose_boxes_can_be_pasted(tmp_path, house, mon
     assert "place " not in capsys.readouterr().out
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("phone", [False, True])
 def test_the_box_drawn_in_the_page_of_a_refusal_holds_the_object_and_its_command_finds_it(tmp_path, house, phone):
     others = plant("sculpture", 7, ground=False, noise=0.005, density_ratio=1.0).scene
