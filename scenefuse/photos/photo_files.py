@@ -34,8 +34,8 @@ UNREADABLE |= frozenset((".rwl", ".sr2", ".mef", ".mrw", ".erf", ".kdc", ".dcr",
 
 # Phones' photos have 200 million pixels. A small file that claims more would fill the memory.
 MAX_PIXELS = 250_000_000
-# What decoding a damaged picture ends with.
-UNDECODABLE = (
+# What decoding a damaged file ends with; a parser's error is a SyntaxError.
+DAMAGED = (
     *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
     *(SyntaxError, MemoryError, struct.error),
 )
@@ -287,7 +287,7 @@ def open_picture(path: Path) -> Iterator[Image]:
             if image.width * image.height > MAX_PIXELS:
                 raise ValueError(f"{image.width} x {image.height} pixels are more than any camera takes")
             yield image
-    except (*UNDECODABLE, Image.DecompressionBombError) as error:
+    except (*DAMAGED, Image.DecompressionBombError) as error:
         why = str(error) or type(error).__name__
         if isinstance(error, Image.UnidentifiedImageError):
             heic = head(path)[4:8] == b"ftyp"

@@ -1,14 +1,13 @@
 """A table of clicks: edits of its rows, what the workflow would refuse in them, and the file that holds each change."""
 
 import csv
-import hashlib
 import io
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from scenefuse.core.stage import StageError, atomic_file
+from scenefuse.core.stage import StageError, atomic_file, sha256
 from scenefuse.core.tables import read_cells, read_text
 from scenefuse.crop.crop_scene import MIN_FIDUCIALS
 from scenefuse.marks.clicks import (
@@ -275,7 +274,7 @@ class Document:
 def digest(path: Path) -> str:
     """SHA-256 of a file's bytes; "" where there is none."""
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        return sha256(path)
     except OSError:
         return ""
 

@@ -17,12 +17,11 @@ from scipy import ndimage
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, scratch_directory, write_json
 from scenefuse.core.transforms import Array
-from scenefuse.photos.cameras.given import PosedPhoto, at_size, possible_turns
+from scenefuse.photos.cameras.given import PosedPhoto, at_size, possible_turns, same_shape
 from scenefuse.photos.cameras.json_cameras import PERSPECTIVE
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
 from scenefuse.photos.photo_files import JPEG, frame_name, masks_by_name, pictures_below, stored_size
 from scenefuse.photos.photos import (
-    SHAPE_TOLERANCE,
     bits_to_stretch,
     each_photo,
     has_16_bits,
@@ -330,11 +329,11 @@ def _mask(file: Path | None, picture: Picture) -> Picture | None:
     """A mask file at the photo's size, 0 or 255 but where it was resampled; None without a file."""
     if file is None:
         return None
-    size = picture.shape[1::-1]
+    size = picture.shape[1], picture.shape[0]
     return np.asarray(cv2.resize(255 * read_mask(file, size).astype(np.uint8), size, interpolation=cv2.INTER_AREA))
 
 
-def read_mask(file: Path, size: tuple[int, ...]) -> NDArray[np.bool_]:
+def read_mask(file: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
     """A mask (H, W), of any size, of a photo of this (width, height).
 
     Raises:
@@ -347,7 +346,7 @@ def read_mask(file: Path, size: tuple[int, ...]) -> NDArray[np.bool_]:
             f"the mask {file} cannot be read ({str(error).split(';')[0]}); export it again as PNG"
         ) from None
     (height, width), (photo_width, photo_height) = mask.shape, size
-    if abs(width * photo_height / (height * photo_width) - 1) > SHAPE_TOLERANCE:
+    if not same_shape((width, height), size):
         raise StageError(
             f"the mask {file} is {width} x {height} pixels, its photo {photo_width} x {photo_height}; export it at the"
             " photo's size"

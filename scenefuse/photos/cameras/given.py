@@ -102,7 +102,7 @@ def at_size(camera: pycolmap.Camera, size: Size, where: str) -> pycolmap.Camera:
         StageError: the copies have another shape.
     """
     width, height = size
-    if not _same_shape(camera, size):
+    if not same_shape((camera.width, camera.height), size):
         raise StageError(
             f"{where} has {width} x {height} pixels, but its camera {camera.width} x {camera.height}; give the photos"
             " that the camera was computed for, or copies scaled alike"
@@ -119,8 +119,9 @@ def largest(models: Mapping[str, Sequence[object]]) -> tuple[str, list[str]]:
     return name, [f"the model {name} is taken, with {len(photos)} photos, and not {counts}"] if others else []
 
 
-def _same_shape(camera: pycolmap.Camera, size: Size) -> bool:
-    return bool(abs(camera.width / camera.height * size[1] / size[0] - 1) <= SHAPE_TOLERANCE)
+def same_shape(one: Size, other: Size) -> bool:
+    """Whether pictures of these (width, height) may be copies of each other."""
+    return bool(abs(one[0] / one[1] * other[1] / other[0] - 1) <= SHAPE_TOLERANCE)
 
 
 def possible_turns(
@@ -142,13 +143,12 @@ def possible_turns(
     turned = {
         name: QUARTERS[o] for name, o in orientations.items() if o in QUARTERS and name in posed and name in sizes
     }
-    shapes = {
-        name: (_same_shape(posed[name].camera, sizes[name]), _same_shape(posed[name].camera, sizes[name][::-1]))
-        for name, quarters in turned.items()
-        if quarters % 2
-    }
-    stored = [name for name, (upright, lying) in shapes.items() if lying and not upright]
-    as_they_are = [name for name, (upright, lying) in shapes.items() if upright and not lying]
+    stored, as_they_are = list[str](), list[str]()
+    for name in (name for name, quarters in turned.items() if quarters % 2):
+        own = posed[name].camera.width, posed[name].camera.height
+        upright, lying = same_shape(own, sizes[name]), same_shape(own, sizes[name][::-1])
+        stored += [name] if lying and not upright else []
+        as_they_are += [name] if upright and not lying else []
     if not turned or (as_they_are and not stored):
         return [dict(posed)]
     other = dict(posed) | {

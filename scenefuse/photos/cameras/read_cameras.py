@@ -3,7 +3,6 @@ bundle.out with list.txt, which RealityCapture and Metashape export too."""
 
 import re
 import struct
-import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -20,7 +19,16 @@ from scenefuse.core.transforms import Array
 from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, PosedPhoto, colmap_camera, largest
 from scenefuse.photos.cameras.json_cameras import TRANSFORMS, find_opensfm, opensfm_place, read_opensfm, read_transforms
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
-from scenefuse.photos.photo_files import BUNDLER, bundler_list, colmap_models, exports, files_by_name, head, stored_size
+from scenefuse.photos.photo_files import (
+    BUNDLER,
+    DAMAGED,
+    bundler_list,
+    colmap_models,
+    exports,
+    files_by_name,
+    head,
+    stored_size,
+)
 
 Found = TypeVar("Found")
 LAYOUTS = (
@@ -45,11 +53,6 @@ UNREAD = {
 }
 # What may follow a photo's name in the list: a zero, and its focal length by EXIF.
 FOCAL = re.compile(r"\s+0\s+[-+.\deE]+$")
-# What reading a damaged file ends with.
-DAMAGED = (
-    *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError),
-    *(ET.ParseError, struct.error),
-)
 # How far the axes of a pose, as programs write it in a few digits, may be from a rotation's.
 MAX_SKEW = 1e-3
 Image = tuple[str, int, list[float]]
