@@ -152,10 +152,10 @@ def to_wgs84(crs: pyproj.CRS, points: Array, where: str) -> Array:
     return np.column_stack([found[:, ::-1], points[:, 2] * unit_m(crs)])
 
 
-def check_place(crs: str, points: Array, source: Path) -> None:
+def check_place(crs: pyproj.CRS, points: Array, source: Path) -> None:
     """StageError where the middle of a file's points (N, 3) lies far from where their projected CRS is used; near the
     CRS's zero, where it lies outside at all."""
-    known = registered(plane(registered(pyproj.CRS.from_user_input(crs))))
+    known = registered(plane(registered(crs)))
     if known.is_projected:
         middle = np.median(points, axis=0)
         beyond = 0.0 if (abs(middle[:2]) < MAX_SITE_COORDINATE).all() else MAX_BEYOND_DEG

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from scenefuse.cloud.readers.las import LAS_DIMENSIONS, WITHHELD, las_crs, las_d
 from scenefuse.cloud.tiled_cloud import open_cloud, write_tiled
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Array, Sim3
+
+if TYPE_CHECKING:
+    import pyproj
 
 # Fewer different points give no features to register by.
 MIN_POINTS = 200
@@ -48,16 +51,13 @@ def import_scene_cloud(
     """
     file = ImportedFile.of(source, LAS_DIMENSIONS)
     sample = file.summary.sample
-    crs = crs_of(source, crs)
-    unit, name = "scene units", None
-    if crs is not None:
-        import pyproj
-
+    own = crs_of(source, crs)
+    unit, name = unit_and_name(own)
+    if own is not None:
         from scenefuse.cloud.crs import check_place, usable
 
-        usable(pyproj.CRS.from_user_input(crs), str(source), local=True)
-        unit, name = unit_and_name(crs)
-        check_place(crs, sample, source)
+        usable(own, str(source), local=True)
+        check_place(own, sample, source)
     origin = near_origin(sample)
     shift = Sim3(1.0, np.eye(3), origin)
     content = file.write(cloud, lambda part: part.transformed(shift.inverse()), unit)
@@ -71,20 +71,18 @@ def import_scene_cloud(
     write_json(georeference_json, place)
 
 
-def crs_of(source: Path, said: str | None) -> str | None:
+def crs_of(source: Path, said: str | None) -> "pyproj.CRS | None":
     """The CRS of a file: its own, or the one that a user says, perhaps with heights that the file does not know."""
     known = las_crs(source)
     if said is None:
         return known
-    import pyproj
-
     from scenefuse.cloud.crs import plane, projected_crs, registered
 
     crs = projected_crs(said, f"the column crs for {source.name}", heights=True)
-    own = None if known is None else registered(pyproj.CRS.from_wkt(known))
+    own = None if known is None else registered(known)
     if own is not None and (plane(own) != plane(crs) or (own.is_compound and own != crs)):
         raise StageError(f"{source} is in {own.name}, but the column crs says {crs.name}; empty that cell")
-    return str(crs.to_string())
+    return crs
 
 
 def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
@@ -223,10 +221,9 @@ class ImportedFile:
         }
 
 
-def unit_and_name(crs: str) -> tuple[str, str]:
+def unit_and_name(crs: "pyproj.CRS | None") -> tuple[str, str | None]:
     """The unit of a projected CRS, "m" for metres, and its name: an EPSG code where it has one, else its WKT."""
-    import pyproj
-
-    known = pyproj.CRS.from_user_input(crs)
-    unit = known.axis_info[0] if known.axis_info else None
-    return "m" if unit is None or unit.unit_conversion_factor == 1 else unit.unit_name, known.to_string()
+    if crs is None:
+        return "scene units", None
+    unit = crs.axis_info[0] if crs.axis_info else None
+    return "m" if unit is None or unit.unit_conversion_factor == 1 else unit.unit_name, crs.to_string()

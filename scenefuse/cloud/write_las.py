@@ -28,7 +28,7 @@ LAS_DESCRIPTIONS = {
 LENGTHS = {"deviation", "world_deviation"}
 
 
-def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | None) -> None:
+def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: Any) -> None:
     """Write LAZ 1.4, coordinates to a millimetre, or finer where the points ask for it; without a CRS to 1e-8 of the
     cloud's diagonal.
 
@@ -62,7 +62,7 @@ class LasLayout:
     @classmethod
     def of(
         cls, path: Path, like: Cloud, box: tuple[NDArray[np.float64], NDArray[np.float64]],
-        origin: NDArray[np.float64], crs: str | None, apart: float,
+        origin: NDArray[np.float64], crs: Any, apart: float,
     ) -> "LasLayout":  # fmt: skip
         """For clouds of `like`'s columns in a box between two corners (3,) relative to `origin`; much closer than a
         millimetre, points that lie `apart` ask for finer steps."""

@@ -131,7 +131,7 @@ def _way_to_cameras(source: Path, sample: Array, sparse: Path, content: dict[str
     if place is None or not misfit(fit):
         check_fit(source, fit)
         return Way(given.apply, given, None), fit
-    crs, place = pyproj.CRS.from_user_input(las_crs(source) or place.crs), place.after(given)
+    crs, place = las_crs(source) or place.crs, place.after(given)
 
     def exact(points: Array) -> Array:
         return place.model_from(points, crs)

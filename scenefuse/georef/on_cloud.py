@@ -63,7 +63,7 @@ def cloud_crs(cloud: Path, crs: str | None) -> pyproj.CRS:
             f"{cloud} names no CRS, so nothing says where the photos lie in it: fill the column crs, or give the"
             " cameras of the cloud's project in the column cameras"
         )
-    return usable(pyproj.CRS.from_user_input(named), str(cloud))
+    return usable(named, str(cloud))
 
 
 def fit_to_cameras(points: Array, model: pycolmap.Reconstruction) -> dict[str, Any]:
@@ -202,7 +202,7 @@ def _beside(cloud: Path, own: Array, crs: pyproj.CRS, frame: LocalFrame) -> Arra
     low, high = corners.min(0), corners.max(0)
     low[2], high[2] = -np.inf, np.inf
     file = CloudFile.of(cloud, (low, high), MAX_COMPARED)
-    check_place(crs.to_wkt(), file.summary.sample, cloud)
+    check_place(crs, file.summary.sample, cloud)
     if len(file.part) < MIN_OVER:
         off = in_local(np.median(file.summary.sample, axis=0)[None], crs, frame, cloud)[0, :2] - np.median(
             own[:, :2], axis=0

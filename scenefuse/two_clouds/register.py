@@ -116,7 +116,7 @@ def register(
     if scales is not None:
         _check_size(scales, given)
     crs = las_crs(scene)
-    unit = "scene units" if crs is None else unit_and_name(crs)[0]
+    unit, _ = unit_and_name(crs)
     marked = known.fiducials is not None or known.crop_box is not None
     whole = given.scene.part
     found, part, places = find_in_scene(
@@ -230,14 +230,11 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
 
 def _notes(object: Path, scene: Path) -> list[str]:
     """What a user should know of the coordinate systems of both files."""
-    texts = las_crs(object), las_crs(scene)
-    if texts == (None, None):
+    own, other = las_crs(object), las_crs(scene)
+    if own is None and other is None:
         return []
-    import pyproj
-
     from scenefuse.cloud.crs import mixed_units
 
-    own, other = (None if text is None else pyproj.CRS.from_wkt(text) for text in texts)
     notes = [
         f"{path} counts its plane and its heights in {units}, as its CRS says: no turned object fits; bring both into"
         " one unit"
@@ -284,7 +281,7 @@ def _check_size(scales: ScaleRange, given: Given) -> None:
         )
 
 
-def _write_placed(path: Path, cloud: Cloud, crs: str | None) -> None:
+def _write_placed(path: Path, cloud: Cloud, crs: Any) -> None:
     if path.suffix == ".ply":
         write_cloud(path, cloud)
         return

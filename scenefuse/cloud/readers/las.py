@@ -4,12 +4,15 @@ import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, POSITION, Columns, check_count
 from scenefuse.core.stage import StageError
+
+if TYPE_CHECKING:
+    import pyproj
 
 ENDINGS = (".las", ".laz")
 # What LAS says of a point that a scene's cloud keeps, and as what; of points that were measured otherwise both are 0.
@@ -19,24 +22,20 @@ NOISE = (7, 18)
 WITHHELD = "withheld"
 
 
-def las_crs(path: Path) -> str | None:
-    """The coordinate system of a LAS or LAZ file as WKT; None where it has none, and for any other file."""
+def las_crs(path: Path) -> "pyproj.CRS | None":
+    """The coordinate system of a LAS or LAZ file; None where it has none, and for any other file."""
     if path.suffix.lower() not in ENDINGS:
         return None
     import laspy
 
     _check_header(path)
     with laspy.open(path) as file:
-        crs = _crs(file.header)
-    return None if crs is None else crs.to_wkt()
+        return _crs(file.header)
 
 
 def check_projected(path: Path) -> None:
     """StageError where a LAS or LAZ file is in degrees."""
-    import pyproj
-
-    wkt = las_crs(path)
-    crs = None if wkt is None else pyproj.CRS.from_wkt(wkt)
+    crs = las_crs(path)
     if crs is not None and crs.is_geocentric:
         raise StageError(
             f"{path} is in geocentric coordinates ({crs.name}), with z along the earth's axis; project it first"
@@ -136,8 +135,8 @@ def _check_header(path: Path) -> None:
         check_count(path, count, held)
 
 
-def _crs(header: Any) -> Any:
-    """The pyproj CRS of a LAS header, or None; an entry that pyproj cannot read counts as none."""
+def _crs(header: Any) -> "pyproj.CRS | None":
+    """The CRS of a LAS header, or None; an entry that pyproj cannot read counts as none."""
     from pyproj.exceptions import CRSError
 
     from scenefuse.cloud.crs import with_units
