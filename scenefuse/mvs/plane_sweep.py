@@ -60,8 +60,6 @@ class DepthMapSettings:
     """The best so many sources of a hypothesis count; the others are taken as occluded (torch only)."""
     planes: int = 96
     """At most so many inverse-depth hypotheses in the sweep (torch only)."""
-    sweep_reduction: int = 2
-    """The sweep runs on photos this much smaller; the refinement doubles the size step by step (torch only)."""
     window_px: int = 7
     """Side of the matching window in pixels, odd."""
     smoothness: float = 0.1
@@ -101,9 +99,8 @@ def estimate_depth(
         settings: see DepthMapSettings.
         device: a PyTorch device, "cpu" or "cuda".
     """
-    reductions = [2**k for k in range(round(math.log2(settings.sweep_reduction)), -1, -1)]
     inverse = torch.zeros(0)
-    for level, reduction in enumerate(reductions):
+    for level, reduction in enumerate((2, 1)):  # the sweep runs at half size
         sizes = [(round(v.width / reduction), round(v.height / reduction)) for v in (reference, *sources)]
         first, *others = (v.resized(*size) for v, size in zip((reference, *sources), sizes))
         matcher = Matcher(first, others, settings.best_sources, settings.window_px, device)

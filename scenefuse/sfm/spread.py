@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, value, write_json
+from scenefuse.core.stage import StageError, atomic_file, read_json, value
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.geometry.icp import change_between
 from scenefuse.photos.workspace import read_model
@@ -67,25 +67,19 @@ class Spread:
         return np.asarray(richer.T @ richer + (len(left_out) - 1) / len(left_out) * about.T @ about)
 
 
-def estimate_spread(*, sparse: Path, sparse_json: Path, spread: Path, report: Path) -> None:
+def estimate_spread(*, sparse: Path, sparse_json: Path, spread: Path) -> None:
     """Adjust a model again without each of its photos' groups and with a richer lens; see `Spread`.
 
     Args:
         sparse: COLMAP model.
         sparse_json: JSON of the mapping stage, for the lens.
         spread: output, NPZ of a `Spread`, in the model's frame.
-        report: output, JSON: number of models and points.
     """
     known = read_json(sparse_json)
     model = read_model(sparse)
     beyond = value(known, "next_lens")
     found = spread_of(model, LENSES[value(known, "lens")], None if beyond is None else LENSES[beyond])
     write_spread(spread, found)
-    content = {
-        "models": quantity(len(found.whole), "1"),
-        "points": quantity(len(found.points), "1"),
-    }
-    write_json(report, content)
     print(f"{len(found.whole)} models, {len(found.points)} points", flush=True)
 
 

@@ -7,7 +7,7 @@
 #           .../sparse/, sparse.json                                        cameras and sparse points
 #           results/scenes/{scene}/georeferenced/, georeference.json        the same in metres, z up, adjusted to the survey
 #           results/scenes/{scene}/residuals.tsv                            what is left at control points, check points, positions
-#           .../spread.npz, spread.json                                     how far the model may be bent
+#           .../spread.npz                                                  how far the model may be bent
 #           .../undistorted/, undistorted.json                              photos with pinhole cameras: a COLMAP workspace
 
 
@@ -302,8 +302,7 @@ rule estimate_scene_spread:
         model="results/scenes/{scene}/georeferenced",
         report="results/scenes/{scene}/sparse.json",
     output:
-        spread="results/scenes/{scene}/spread.npz",
-        report="results/scenes/{scene}/spread.json",
+        "results/scenes/{scene}/spread.npz",
     log:
         "results/logs/estimate_scene_spread/{scene}.log",
     benchmark:
@@ -320,8 +319,7 @@ rule estimate_scene_spread:
     message:
         "Scene {wildcards.scene}: how far the model may be bent"
     shell:
-        "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --spread {output.spread} --report {output.report}"
-        " &> {log}"
+        "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --spread {output} &> {log}"
 
 
 use rule estimate_scene_spread as estimate_object_spread with:
@@ -329,8 +327,7 @@ use rule estimate_scene_spread as estimate_object_spread with:
         model="results/objects/{object}/sparse",
         report="results/objects/{object}/sparse.json",
     output:
-        spread="results/objects/{object}/spread.npz",
-        report="results/objects/{object}/spread.json",
+        "results/objects/{object}/spread.npz",
     log:
         "results/logs/estimate_object_spread/{object}.log",
     benchmark:
