@@ -103,11 +103,6 @@ def check_count(path: Path, counted: int, there: int, what: str = "points", advi
         )
 
 
-def rows_behind(lines: Iterable[bytes], width: int) -> int:
-    """How many lines hold so many cells."""
-    return sum(len(line.split()) == width for line in lines)
-
-
 def positions(columns: Columns) -> NDArray[np.float64]:
     """(N, 3) positions."""
     return np.stack([columns[axis].astype(np.float64) for axis in POSITION], axis=1)
@@ -215,13 +210,56 @@ def number_rows(
     return np.concatenate(found)
 
 
-def next_rows(lines: Iterator[bytes], most: int, width: int, where: tuple[str, int]) -> tuple[NDArray[np.float64], int]:
-    """The next rows (N, C) of a file, so many at most and all their numbers, and the number of the line behind them."""
-    found, line = [np.empty((0, width))], where[1]
+def stored_rows(
+    path: Path, begin: int, row: np.dtype[Any], count: int, at_once: int, is_text: bool, last: bool = True
+) -> Iterator[Columns]:
+    """The fields of so many rows that begin at a byte of a file, so many rows at a time: (N,), or (N, n) of several
+    numbers each.
+
+    Args:
+        path: of the file.
+        begin: the byte.
+        row: the fields, in the file's byte order.
+        count: of rows, as the header has it.
+        at_once: rows.
+        is_text: whether they are lines of numbers.
+        last: whether nothing stands behind them.
+
+    Raises:
+        StageError: there are fewer rows, or more lines.
+    """
+    with open(path, "rb") as file:
+        left, line = count, 1 + file.read(begin).count(b"\n")
+        while left:
+            most = min(left, at_once)
+            if is_text:
+                found, line = text_rows(path, file, row, most, line)
+            else:
+                rows = np.fromfile(file, row, most)
+                found = {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in row.names or ()}
+            there = len(next(iter(found.values())))
+            if not there:
+                check_count(path, count, count - left)
+            left -= there
+            yield found
+        if is_text and last:
+            width = len(_numbers_of(row))
+            check_count(path, count, count + sum(len(line.split()) == width for line in file))
+
+
+def text_rows(path: Path, lines: Iterator[bytes], row: np.dtype[Any], most: int, first: int) -> tuple[Columns, int]:
+    """The fields of the next rows of a text, so many at most, and the number of the line behind them; of `first`, the
+    next one. Single precision has the digits of the text; missing integers are 0, and large ones the largest."""
+    numbers, line = _numbers_of(row), first
+    found = [np.empty((0, len(numbers)))]
     while (missing := most - sum(map(len, found))) and (some := list(islice(lines, missing))):
-        found.append(number_rows(some, None, width, range(width), width, (where[0], line)))
+        found.append(number_rows(some, None, len(numbers), range(len(numbers)), len(numbers), (str(path), line)))
         line += len(some)
-    return np.concatenate(found), line
+    rows, columns = np.concatenate(found), Columns()
+    for name in row.names or ():
+        at = [k for k, own in enumerate(numbers) if own == name]
+        columns[name] = typed(rows[:, at] if row[name].shape else rows[:, at[0]], row[name].base)
+    return columns, line
 
 
 def typed(values: NDArray[np.float64], kind: np.dtype[Any]) -> NDArray[Any]:
@@ -230,6 +268,11 @@ def typed(values: NDArray[np.float64], kind: np.dtype[Any]) -> NDArray[Any]:
         return values
     ends = np.iinfo(kind)
     return np.clip(np.rint(np.nan_to_num(values)), ends.min, ends.max).astype(kind)
+
+
+def _numbers_of(row: np.dtype[Any]) -> list[str]:
+    """The field of each number of a row."""
+    return [name for name in row.names or () for _ in range(int(np.prod(row[name].shape)))]
 
 
 def _together(

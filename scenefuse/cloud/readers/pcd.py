@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import Columns, check_count, next_rows, rows_behind, typed
+from scenefuse.cloud.readers.columns import Columns, check_count, stored_rows
 
 
 @dataclass(frozen=True)
@@ -23,14 +22,12 @@ class _Header:
         count: of rows.
         data: ascii, binary or binary_compressed.
         begin: the byte where the rows begin.
-        lines: of the header.
     """
 
     row: np.dtype[Any]
     count: int
     data: str
     begin: int
-    lines: int
 
 
 def read_pcd(path: Path, at_once: int) -> Iterator[Columns]:
@@ -41,27 +38,21 @@ def read_pcd(path: Path, at_once: int) -> Iterator[Columns]:
         ValueError: it is no PCD, or damaged.
     """
     header = _header(path)
-    read = {"ascii": _lines, "binary": _rows, "binary_compressed": _compressed}.get(header.data)
-    if read is None:
+    if header.data == "binary_compressed":
+        parts = _compressed(path, header, at_once)
+    elif header.data in ("ascii", "binary"):
+        parts = stored_rows(path, header.begin, header.row, header.count, at_once, header.data == "ascii")
+    else:
         raise ValueError(f"its DATA is '{header.data}'")
-    count = 0
-    for fields in read(path, header, at_once):
-        count += len(fields[0])
-        yield {
-            name: values[:, 0]
-            for name, values in zip(header.row.names or (), fields)
-            if values.shape[1] == 1 and not name.startswith(" ")
-        }
-    check_count(path, header.count, count)
+    for fields in parts:
+        yield {name: values for name, values in fields.items() if values.ndim == 1 and not name.startswith(" ")}
 
 
 def _header(path: Path) -> _Header:
     words: dict[str, list[str]] = {}
-    lines = 0
     with open(path, "rb") as file:
         while "DATA" not in words:
             line = file.readline()
-            lines += 1
             cells = line.decode("latin-1").split()
             words |= {cells[0].upper(): cells[1:]} if cells else {}
             if not line:
@@ -79,40 +70,12 @@ def _header(path: Path) -> _Header:
     there, odd = divmod(path.stat().st_size - begin, size)
     if data == "binary" and (there < count or not odd):
         check_count(path, count, there)
-    return _Header(np.dtype([(n, kind, (k,)) for n, kind, k in zip(names, types, repeats)]), count, data, begin, lines)
+    row = np.dtype([(name, kind, (k,) if k != 1 else ()) for name, kind, k in zip(names, types, repeats)])
+    return _Header(row, count, data, begin)
 
 
-def _lines(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
-    """The fields (N, n) each of rows of text."""
-    left, line = header.count, header.lines + 1
-    kinds = [kind.subdtype or (kind, (1,)) for kind, *_ in (header.row.fields or {}).values()]
-    ends = np.cumsum([0, *(shape[0] for _, shape in kinds)])
-    with open(path, "rb") as file:
-        file.seek(header.begin)
-        while left:
-            rows, line = next_rows(file, min(at_once, left), ends[-1], (str(path), line))
-            if not len(rows):
-                return
-            left -= len(rows)
-            yield [typed(rows[:, at : at + n], kind) for at, (kind, (n,)) in zip(ends, kinds)]
-        check_count(path, header.count, header.count + rows_behind(file, ends[-1]))
-
-
-def _rows(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
-    """The same of binary rows."""
-    left = header.count
-    with open(path, "rb") as file:
-        file.seek(header.begin)
-        while left:
-            rows = np.fromfile(file, header.row, min(at_once, left))
-            if not len(rows):
-                return
-            left -= len(rows)
-            yield [np.ascontiguousarray(rows[name]) for name in header.row.names or ()]
-
-
-def _compressed(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
-    """The same of compressed columns, one after the other."""
+def _compressed(path: Path, header: _Header, at_once: int) -> Iterator[Columns]:
+    """The fields of compressed columns, one after the other."""
     with open(path, "rb") as file:
         file.seek(header.begin)
         packed, size = (int(number) for number in np.fromfile(file, "<u4", 2))
@@ -121,12 +84,12 @@ def _compressed(path: Path, header: _Header, at_once: int) -> Iterator[list[NDAr
     # A copy of 264 bytes takes three.
     if size > 88 * packed or size != header.count * header.row.itemsize:
         raise ValueError("its compressed part is not as long as its header says")
-    raw, fields, at = _lzf(content, size), [], 0
-    for kind, *_ in (header.row.fields or {}).values():
-        fields.append(np.ndarray(header.count, kind, raw, at))
-        at += kind.itemsize * header.count
+    raw, fields, at = _lzf(content, size), Columns(), 0
+    for name in header.row.names or ():
+        fields[name] = np.ndarray(header.count, header.row[name], raw, at)
+        at += header.row[name].itemsize * header.count
     for first in range(0, header.count, at_once):
-        yield [values[first : first + at_once] for values in fields]
+        yield {name: values[first : first + at_once] for name, values in fields.items()}
 
 
 def _lzf(packed: bytes, size: int) -> bytearray:

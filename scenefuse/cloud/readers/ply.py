@@ -17,9 +17,9 @@ from scenefuse.cloud.readers.columns import (
     check_count,
     colors_of,
     named,
-    next_rows,
     positions,
-    rows_behind,
+    stored_rows,
+    text_rows,
     typed,
 )
 from scenefuse.cloud.readers.meshes import Array, Material, Mesh, of_strip, picture_beside, sampled_columns, triangles
@@ -104,7 +104,9 @@ def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
     if not is_text:
         check_size(path, elements, offset)
     if in_rows(path):
-        yield from _rows(path, elements, offset, is_text, at_once)
+        row, count, last = elements[0].row, elements[0].count, len(elements) == 1
+        assert row is not None
+        yield from stored_rows(path, offset, row, count, at_once, is_text, last)
         return
     tables = _tables_of_text(path, elements, offset) if is_text else _tables_of_bytes(path)
     vertex, face = named(_numbers(tables.get("vertex", {}))), tables.get(FACES, {})
@@ -176,7 +178,7 @@ def _tables_of_text(path: Path, elements: list[Element], offset: int) -> dict[st
         file.seek(offset)
         for element in elements:
             if element.row is not None:
-                found: dict[str, Any] = _columns_of_text(path, file, element, element.count)[0]
+                found: dict[str, Any] = text_rows(path, file, element.row, element.count, 1)[0]
                 there = len(next(iter(found.values()), ()))
             else:
                 rows = list(islice((line for line in file if line.strip()), element.count))
@@ -203,40 +205,6 @@ def _cells(element: Element, cells: list[bytes]) -> Iterator[Array]:
         end = at + (1 + int(float(cells[at])) if is_list else 1)
         yield np.array(cells[at + is_list : end], np.float64)
         at = end
-
-
-def _rows(path: Path, elements: list[Element], offset: int, is_text: bool, at_once: int) -> Iterator[Columns]:
-    """The columns of a PLY whose points come first, without lists, so many rows at a time."""
-    element, *others = elements
-    left, row = element.count, element.row
-    assert row is not None and row.names is not None
-    with open(path, "rb") as file:
-        line = 1 + file.read(offset).count(b"\n")
-        while left:
-            most = min(left, at_once)
-            if is_text:
-                columns, line = _columns_of_text(path, file, element, most, line)
-            else:
-                rows = np.fromfile(file, row, most)
-                columns = {name: rows[name].astype(row[name].newbyteorder("=")) for name in row.names}
-            count = len(next(iter(columns.values()), ()))
-            if not count:
-                check_count(path, element.count, element.count - left)
-            left -= count
-            yield columns
-        if is_text and not others:
-            check_count(path, element.count, element.count + rows_behind(file, len(row.names)))
-
-
-def _columns_of_text(path: Path, file: BinaryIO, element: Element, most: int, line: int = 1) -> tuple[Columns, int]:
-    """The next rows of text, so many at most, and the number of the line behind them.
-
-    Single precision has the digits of the text; missing integers are 0, and large ones the largest.
-    """
-    row = element.row
-    assert row is not None and row.names is not None
-    rows, line = next_rows(file, most, len(row.names), (str(path), line))
-    return {name: typed(rows[:, k], row[name]) for k, name in enumerate(row.names)}, line
 
 
 def header_of(elements: list[Element]) -> bytes:
