@@ -24,7 +24,9 @@ from scenefuse.report.values import WORDS, find, length, percent, percents, read
 Row = Mapping[str, Any]
 # Photos of a scene whose ground pixels and dates are looked at, spread evenly.
 LOOKED_AT = 20
-DONE = ("registered", "ungated", ALONE)
+# Others look before as after.
+ADDED = ("registered", "ungated")
+DONE = (*ADDED, ALONE)
 # A wider angle without any photo leaves a side of the object unseen.
 MAX_GAP_DEG = 100.0
 # Masks are mentioned where more than this share of the photos is left out, or where the others agree by less (IoU).
@@ -65,15 +67,15 @@ def object_facts(row: Row) -> dict[str, str]:
         facts["Photos"] += f", taken {has['photographed']}" if "photographed" in has else ""
     folder = f"results/objects/{has['object']}"
     if "added_points" in has:
-        facts["File"] = f"{folder}/fused.ply with its surroundings ({_local(unit)})"
+        facts["File"] = f"{folder}/fused.ply with its surroundings (local frame, {_plural(unit)})"
     elif status == ALONE:
-        facts["File"] = f"{folder}/object.ply (a frame of its own, {unit})"
+        facts["File"] = f"{folder}/object.ply (a frame of its own, {_plural(unit)})"
     return _capital(facts | _next(has))
 
 
-def _local(unit: str) -> str:
-    """The frame of all files of a scene that are not in its CRS."""
-    return f"local frame, {'metres' if unit == 'm' else unit}"
+def _plural(unit: str) -> str:
+    """A unit in words."""
+    return "metres" if unit == "m" else unit
 
 
 def _of_lengths(scale_sd: float, unit: str) -> str:
@@ -87,21 +89,22 @@ def is_current(made: Path, source: Path) -> bool:
     return made.is_file() and source.is_file() and made.stat().st_mtime >= source.stat().st_mtime
 
 
-def surface_facts(folder: Path, unit: str = "m") -> dict[str, str]:
-    """The same of the surface in an object's results, in the scene's unit; nothing where none was made of its last
-    fusion."""
+def surface_facts(folder: Path, row: Row) -> dict[str, str]:
+    """The same of the surface in an object's results; nothing where none was made of its last fusion."""
     if not is_current(folder / "surface.json", folder / "fused.ply"):
         return {}
     found = read_json(folder / "surface.json")
     if value(found, "status") == "empty":
         return {"Mesh": f"None: {value(found, 'reason')}"}
-    place = f"results/objects/{folder.name}"
-    mesh = f"{place}/surface.ply ({_local(unit)}), {place}/surface.glb (the same, metres, y up)"
+    place, has = f"results/objects/{folder.name}", _known(row)
+    unit = _plural(has.get("unit", "m"))
+    mesh = f"{place}/surface.ply (local frame, {unit}), {place}/surface.glb (the same, metres, y up)"
     if bridged := value(found, "bridged_area"):
         mesh += f"; {bridged:.2g} {found['bridged_area']['unit'].replace('2', '²')} of it {WORDS['bridged']}"
     if not is_current(folder / "drawings/drawings.pdf", folder / "surface.json"):
         return {"Mesh": mesh}
-    return {"Mesh": mesh, "Drawings": f"{place}/drawings/drawings.pdf, to scale; above.tif beside it is in the CRS"}
+    above = f"; above.tif beside it is in {has['crs']}" if "crs" in has else ""
+    return {"Mesh": mesh, "Drawings": f"{place}/drawings/drawings.pdf, to scale{above}"}
 
 
 def accuracies(row: Row) -> list[str]:
@@ -197,8 +200,8 @@ def made_by(summary: Path) -> str:
     """By what, when and, if scenes.tsv says so, by whom the results were made."""
     file = summary / "scenes.tsv"
     day = date.fromtimestamp(file.stat().st_mtime) if file.is_file() else date.today()
-    who = dict.fromkeys(_known(row).get("made_by") for row in records(read_table(file)))
-    return f"Made by {', '.join(filter(None, [*who, f'scenefuse {VERSION}']))} on {day}."
+    who = dict.fromkeys(filter(None, (_known(row).get("made_by") for row in records(read_table(file)))))
+    return f"Made with scenefuse {VERSION}{' by ' if who else ''}{', '.join(who)} on {day}."
 
 
 def closing_lines(summary: Path) -> str:

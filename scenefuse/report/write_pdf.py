@@ -12,7 +12,7 @@ from PIL import Image
 
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.version import VERSION
-from scenefuse.report.facts import made_by, object_facts, rows_of, scene_facts, surface_facts
+from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scene_facts, surface_facts
 from scenefuse.report.values import WORDS, length
 from scenefuse.surface.gltf import metres_per_unit
 
@@ -33,9 +33,9 @@ def write_pdf(
         report: output PDF.
     """
     rows = rows_of(summary, "object", objects)
-    facts = [object_facts(row) | surface_facts(folder, row.get("unit", "m")) for folder, row in zip(objects, rows)]
+    facts = [object_facts(row) | surface_facts(folder, row) for folder, row in zip(objects, rows)]
     page = _Page(title or Path.cwd().name, made_by(summary))
-    page.start(page.project, page.made)
+    page.start(page.project, f"{page.made} The files that are named here lie in the project's folder.")
     for row in rows_of(summary, "scene", scenes):
         page.text_line(f"Scene {row['scene']}", 12)
         page.facts(scene_facts(row))
@@ -45,9 +45,12 @@ def write_pdf(
     page.rows([[f.name, verdict, *more] for f, verdict, more in zip(objects, verdicts, found)], (3, 3, 7, 12))
     for folder in scenes:
         page.pictures([folder / "scene.png"], [f"scene {folder.name}, its cameras and their errors"])
-    for folder, each in zip(objects, facts):
+    for folder, row, each in zip(objects, rows, facts):
         page.start(folder.name, page.made)
         page.facts(each)
+        # What others have of pictures is from an earlier run.
+        if row["status"] not in ADDED:
+            continue
         page.pictures([folder / f"figures/{when}.png" for when in ("before", "after")], ["before", "after"])
         page.start(folder.name, "what is missing, and the four sides")
         if (folder / "drawings/drawings.json").is_file():

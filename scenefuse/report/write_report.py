@@ -11,7 +11,7 @@ import pandas as pd
 import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.report.facts import made_by, object_facts, rows_of, scene_facts, surface_facts
+from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scene_facts, surface_facts
 from scenefuse.report.page import document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
 from scenefuse.report.values import WORDS, asset, number, read_table
@@ -22,8 +22,6 @@ from scenefuse.report.view_mesh import read_mesh
 PAGE_POINTS = 700_000
 # What such objects have of figures is from an earlier run.
 UNFINISHED = ("failed", "missing")
-# Others look before as after.
-ADDED = ("registered", "ungated")
 Row = dict[str, Any]
 Texts = dict[str, Any]
 
@@ -115,7 +113,7 @@ def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str
     parts = [f'<section class="card" id="{escape(folder.name)}"><h2>{escape(folder.name)}{_badge(row)}</h2>']
     is_finished, figures = status not in UNFINISHED, folder / "figures"
     pictures = [_slider(figures)] if status in ADDED and (figures / "before.png").is_file() else []
-    facts = object_facts(row) | (surface_facts(folder, row.get("unit", "m")) if is_finished else {})
+    facts = object_facts(row) | (surface_facts(folder, row) if is_finished else {})
     parts.append(f'<div class="pair">{"".join(pictures)}{_facts(facts)}</div>')
     if view is not None and is_finished:
         mesh = read_mesh(folder, view.unit)

@@ -344,7 +344,7 @@ QUESTIONS = {
     "may I trust the scale?": r"known to 0\.2 %, 22\.4 mm in 10 m",
     "where is the file?": r"objects/\s*house/\s*fused\.ply",
     "what next?": "photograph it from 4 places",
-    "who made it?": r"Made by Hof Müller, scenefuse \d.* on 20\d\d-",
+    "who made it?": r"Made with scenefuse \d.* by Hof Müller on 20\d\d-",
     "which frame?": r"with its surroundings \(local frame, metres\)",
     "what is that beside the GPS?": r"relative: on Earth it is known as well as the scene",
 }

@@ -540,7 +540,7 @@ def test_an_object_says_when_it_was_photographed_and_how_its_lengths_follow_from
     text = (summarise(results, made_by=("Hof Müller",)) / "summary.txt").read_text()
     assert re.search(r"Photos +39 of 40 used, taken 2024-06-02 to 2024-06-03\n", text)
     assert re.search(r"Lengths +Known to 0\.5 %, 50\.0 mm in 10 m \(standard deviation\), plus", text)
-    assert re.search(r"Made by Hof Müller, scenefuse [\d.]+ on 20\d\d-\d\d-\d\d", text)
+    assert re.search(r"Made with scenefuse [\d.]+ by Hof Müller on 20\d\d-\d\d-\d\d", text)
     # Where control points hold the scene, its GPS does not say how well its lengths are known.
     write_json(scene / "georeference.json", here | {"control_points": quantity(5, "1")})
     text = (summarise(results) / "summary.txt").read_text()

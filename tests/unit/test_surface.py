@@ -516,10 +516,10 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
 
 
 def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_interpolated(closed, tmp_path: Path):
-    assert surface_facts(tmp_path) == {}
+    assert surface_facts(tmp_path, {}) == {}
     (tmp_path / "fused.ply").touch()
     write_json(tmp_path / "surface.json", surface_report(closed, "m") | {"reason": quantity("", "")})
-    found = surface_facts(tmp_path)["Mesh"]
+    found = surface_facts(tmp_path, {})["Mesh"]
     assert f"objects/{tmp_path.name}/surface.ply (local frame, metres)" in found and "%" not in found
     assert "surface.glb (the same, metres, y up)" in found
     bridged = surface_report(closed, "m")["bridged_area"]["value"]
@@ -529,7 +529,7 @@ def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_int
     pdf.touch()
     for age, listed in ((10, False), (-10, True)):
         os.utime(pdf, (made - age, made - age))
-        assert ("Drawings" in surface_facts(tmp_path)) == listed
+        assert ("Drawings" in surface_facts(tmp_path, {})) == listed
 
 
 def test_paper_begins_with_an_overview_and_gives_an_object_two_pages_with_its_sides_to_scale(drawings, tmp_path: Path):
@@ -578,8 +578,13 @@ def test_four_sides_on_paper_are_to_the_round_scale_that_is_written_below(coarse
 
 def test_a_report_on_paper_of_what_failed_says_so(tmp_path: Path):
     (tmp_path / "objects.tsv").write_text("object\tstatus\terror\nshed\tfailed\ttoo little overlap\n")
+    (tmp_path / "shed/figures").mkdir(parents=True)
+    Image.new("RGB", (400, 300)).save(tmp_path / "shed/figures/before.png")
     write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")
-    assert "oo little overlap" in pypdfium2.PdfDocument(tmp_path / "r.pdf")[0].get_textpage().get_text_bounded()
+    pages = list(pypdfium2.PdfDocument(tmp_path / "r.pdf"))
+    assert len(pages) == 2 and all("oo little overlap" in page.get_textpage().get_text_bounded() for page in pages)
+    # The picture is from an earlier run.
+    assert not any(list(page.get_objects([3])) for page in pages)
 
 
 def test_pictures_below_a_long_text_on_paper_go_on_on_a_new_page(tmp_path: Path):
@@ -587,7 +592,7 @@ def test_pictures_below_a_long_text_on_paper_go_on_on_a_new_page(tmp_path: Path)
     for name in ("before", "after"):
         Image.new("RGB", (400, 300)).save(tmp_path / f"shed/figures/{name}.png")
     for words in range(480, 600, 15):
-        (tmp_path / "objects.tsv").write_text(f"object\tstatus\terror\nshed\tfailed\t{'overlap ' * words}\n")
+        (tmp_path / "objects.tsv").write_text(f"object\tstatus\tadvice\nshed\tregistered\t{'overlap ' * words}\n")
         write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")
         images = [one for page in pypdfium2.PdfDocument(tmp_path / "r.pdf") for one in page.get_objects([3])]
         assert len(images) == 2 and all(top - low > 40 for _, low, _, top in (image.get_bounds() for image in images))
