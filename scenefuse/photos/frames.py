@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -133,17 +134,10 @@ def _from_video(source: Path, output: Path, settings: FrameSettings) -> dict[str
         raise StageError(f"the video {source} cannot be decoded; convert it to H.264 in an .mp4 file")
     starts = thin_out(count, settings.frame_step, settings.max_frames)
     window_of = np.searchsorted(starts, np.arange(count), side="right") - 1
+    scored = ((sharpness(frame), min(index, count - 1), frame) for index, frame in _decode(source, pictures=True))
     origin: dict[str, dict[str, Any]] = {}
-    best: tuple[float, int, NDArray[Any]] | None = None
-    for index, frame in _decode(source, pictures=True):
-        if best is not None and index < count and window_of[index] != window_of[best[1]]:
-            origin |= _write_frame(output, best, settings)
-            best = None
-        score = sharpness(frame)
-        if best is None or score > best[0]:
-            best = (score, min(index, count - 1), frame)
-    if best is not None:
-        origin |= _write_frame(output, best, settings)
+    for _, window in groupby(scored, lambda one: window_of[one[1]]):
+        origin |= _write_frame(output, *max(window, key=lambda one: one[0]), settings)
     return origin
 
 
@@ -162,9 +156,8 @@ def _decode(source: Path, pictures: bool) -> Iterator[tuple[int, NDArray[Any]]]:
 
 
 def _write_frame(
-    output: Path, best: tuple[float, int, NDArray[Any]], settings: FrameSettings
+    output: Path, score: float, index: int, frame: NDArray[Any], settings: FrameSettings
 ) -> dict[str, dict[str, Any]]:
-    score, index, frame = best
     height, width = frame.shape[:2]
     scale = min(1.0, settings.max_width_px / width)
     if scale < 1.0:
