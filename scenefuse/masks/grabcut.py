@@ -2,7 +2,6 @@
 and sparse points, then cut again along the visual hull."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -61,24 +60,16 @@ def first_trimap(size: tuple[int, int], outline_px: NDArray[np.float64], spannin
     return trimap
 
 
-@dataclass(frozen=True)
-class Colours:
-    """Colour densities of object and background over all photos: one photo alone shows too little of either.
-
-    Attributes:
-        log_ratio: (B, B, B) log of object over background density, per cell of Lab.
-    """
-
-    log_ratio: NDArray[np.float32]
-
-    def evidence(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(H, W) log ratios of a (H, W, 3) RGB photo."""
-        cells = _cells(image)
-        return self.log_ratio[cells[..., 0], cells[..., 1], cells[..., 2]]
+def evidence_of(image: NDArray[np.uint8], log_ratio: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) the log of object over background density for the colours of a (H, W, 3) RGB photo, by that of each cell
+    of Lab (B, B, B)."""
+    cells = _cells(image)
+    return log_ratio[cells[..., 0], cells[..., 1], cells[..., 2]]
 
 
-def learn_colours(images: list[NDArray[np.uint8]], own: list[Mask], others: list[Mask]) -> Colours:
-    """Colours of the pixels that are surely object and of those that are surely not, over all photos."""
+def learn_colours(images: list[NDArray[np.uint8]], own: list[Mask], others: list[Mask]) -> NDArray[np.float32]:
+    """(B, B, B) log of the density of colours of the pixels that are surely object over that of those that are surely
+    not, per cell of Lab, over all photos: one alone shows too little of either."""
     counts = np.zeros((2, COLOUR_BINS, COLOUR_BINS, COLOUR_BINS), dtype=np.float32)
     for image, *sides in zip(images, own, others):
         cells = _cells(image)
@@ -86,7 +77,7 @@ def learn_colours(images: list[NDArray[np.uint8]], own: list[Mask], others: list
             flat = np.ravel_multi_index(tuple(cells[side].T), counts.shape[1:])
             counts[k] += np.bincount(flat, minlength=COLOUR_BINS**3).reshape(counts.shape[1:])
     smooth = np.stack([ndimage.gaussian_filter(c / max(c.sum(), 1), 0.7) for c in counts])
-    return Colours(np.log((smooth[0] + 2e-5) / (smooth[1] + 2e-5)).astype(np.float32))
+    return np.log((smooth[0] + 2e-5) / (smooth[1] + 2e-5)).astype(np.float32)
 
 
 def _cells(image: NDArray[np.uint8]) -> NDArray[np.intp]:
@@ -229,12 +220,13 @@ def cleaned(mask: Mask, image: NDArray[np.uint8] | None = None) -> Mask:
                 for gap in np.flatnonzero(gaps):
                     x, y, width, height = parts[gap, : cv2.CC_STAT_AREA]
                     window = np.s_[y : y + height, x : x + width]
-                    small[gap] = colours.evidence(image[window])[labels[window] == gap].mean() >= -GAP_EVIDENCE_NATS
+                    here = evidence_of(image[window], colours)[labels[window] == gap]
+                    small[gap] = here.mean() >= -GAP_EVIDENCE_NATS
             mask = np.where(small[labels], not side, mask)
     return mask
 
 
-def _colours_of(image: NDArray[np.uint8], mask: Mask, unsure: Mask) -> Colours:
+def _colours_of(image: NDArray[np.uint8], mask: Mask, unsure: Mask) -> NDArray[np.float32]:
     """The colours of a mask (H, W), beside those around it; some thousands of pixels of each are enough."""
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     longest = max(width, height)
@@ -331,7 +323,7 @@ def second_cuts(
     for k, (view, mask, outline) in enumerate(zip(photos.views, masks, outlines)):
         # With the whole band the masks of the demo's house lost 0.002 of IoU, and its held-out photos 0.9 dB.
         band_px = OUTLINE_BAND_SHARE / 2 * view.width
-        trimap = second_trimap(outline, mask, colours.evidence(view.pixels), band_px)
+        trimap = second_trimap(outline, mask, evidence_of(view.pixels, colours), band_px)
         stamp(trimap, target, view, photos.seen[k], photos.seen_at[k], clicked.get(k))
         if not outline.any():
             cut.append(outline)

@@ -1,7 +1,6 @@
 """Where a point that was clicked in some photos is to be expected in another one, once their cameras are known."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,19 +14,6 @@ from scenefuse.pick.document import Sizes
 
 # A ray reaches so many times nearer and farther than the sparse points that the photo sees.
 RAY_REACH = 4
-
-
-@dataclass(frozen=True)
-class Expected:
-    """Where a point is to be expected in a photo.
-
-    Attributes:
-        pixels: (N, 2) one pixel, or a line of them; none where the photo does not see it.
-        from_photos: how many other photos say so: from two or more it is a point, from one a line.
-    """
-
-    pixels: Array
-    from_photos: int
 
 
 class Cameras:
@@ -52,17 +38,16 @@ class Cameras:
         pixels = np.array([point.xy for point in image.get_observation_points2D()]).reshape(-1, 2)
         return pixels * self._sizes[photo] / np.array([camera.width, camera.height])
 
-    def expected(self, clicks: Iterable[Click], photo: str) -> Expected | None:
-        """Where the clicks on one point in other photos say that it is in this one; None where they say nothing."""
+    def expected(self, clicks: Iterable[Click], photo: str) -> Array | None:
+        """(N, 2) pixels where the clicks on one point in other photos say that it is in this one: one, or from a single
+        photo a line of them; none where this photo does not see it; None where they say nothing."""
         others = [c for c in clicks if c.photo != photo and c.photo in self._images]
         if photo not in self._images or not others:
             return None
         if len(others) == 1:
-            return Expected(self._line(others[0], photo), 1)
+            return self._line(others[0], photo)
         position = self._position(others)
-        if position is None:
-            return None
-        return Expected(self._seen(position[None], photo), len(others))
+        return None if position is None else self._seen(position[None], photo)
 
     def residuals(self, clicks: Iterable[Click]) -> dict[str, float]:
         """How far each click on one point is from where all say that it is, px by photo; empty for fewer than two."""

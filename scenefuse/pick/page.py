@@ -209,5 +209,5 @@ def _draw_points(photo_map: PhotoMap, editor: Editor) -> None:
         if here is not None:
             photo_map.draw_point(here, label == editor.point)
         expected = cameras.expected(own, photo) if cameras else None
-        if expected is not None and (label == editor.point or (here is None and expected.from_photos > 1)):
-            photo_map.draw_expected(expected.pixels)
+        if expected is not None and (label == editor.point or (here is None and len(expected) == 1)):
+            photo_map.draw_expected(expected)
