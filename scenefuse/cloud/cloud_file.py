@@ -222,7 +222,7 @@ class CloudFile:
         """Go through a file once.
 
         Args:
-            path: PLY, LAS, LAZ (COPC too), E57, PCD, text, or a mesh (PLY, OBJ, GLB).
+            path: PLY, LAS, LAZ (COPC too), E57, PCD, text, or a mesh (PLY, OBJ, glTF).
             box: what becomes the part.
             most: points that the part should have; of more than twice as many every second, fourth, ... is held.
 

@@ -195,7 +195,7 @@ def sampled_rows(count: int, most: int, seed: int) -> NDArray[np.int64]:
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Read PLY, LAS, LAZ, E57, PCD, text (XYZ, PTS, TXT, ASC, CSV), or a mesh (PLY, OBJ, GLB) as points on its faces.
+    """Read PLY, LAS, LAZ, E57, PCD, text (XYZ, PTS, TXT, ASC, CSV), or a mesh (PLY, OBJ, glTF) as points on its faces.
 
     Rows without a finite position are left out; so are the classes and the like of LAS, and colours that are all black.
 

@@ -37,7 +37,7 @@ def import_scene_cloud(
     """Take a cloud for a scene. The scene's frame has its axes, and z is up; its origin is near the points.
 
     Args:
-        source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, GLB) that points are drawn from.
+        source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, glTF) that points are drawn from.
         crs: of its coordinates, where the file does not say it.
         cloud: output PLY in the scene's frame, tile by tile (`open_cloud`), with classes and intensities of LAS;
             however large, it is never all in memory.

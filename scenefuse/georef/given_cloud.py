@@ -44,7 +44,7 @@ def import_posed_cloud(
     earth.
 
     Args:
-        source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, GLB) that points are drawn from.
+        source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, glTF) that points are drawn from.
         sparse: COLMAP model of the given cameras, with the points that the photos' own matches give; None where the
             scene's photos were laid on this cloud.
         sparse_json: its JSON; where known lengths scaled the model, they scale the cloud alike; it knows where the
