@@ -57,12 +57,10 @@ class Marks:
     Attributes:
         mode: none, masks, cloud, clicks or fiducials.
         fiducials: (F, 3) in the scene frame: the fiducials, or the inside clicks with their depth.
-        voted: scene points that the masks vote for.
     """
 
     mode: str
     fiducials: Array
-    voted: int = 0
 
 
 def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSettings) -> None:
@@ -86,7 +84,6 @@ def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSe
         "mode": quantity(marks.mode, ""),
         "up_cue": quantity(_up_cue(inputs.georeference_json), ""),
         "fiducials": quantity(marks.fiducials, unit),
-        "voted_points": quantity(marks.voted, "1"),
     }
     write_json(report, about | _report(len(scene), part, cut, unit))
 
@@ -206,7 +203,7 @@ def crop_linked(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -
             something else.
     """
     assert inputs.alignment_json is not None
-    pose, voted, other = _alignment(inputs.alignment_json), 0, None
+    pose, other = _alignment(inputs.alignment_json), None
     if inputs.cloud is not None:
         mode, source, by = "cloud", inputs.cloud, "the object's own cloud"
         own = without_strays(read_cloud(inputs.cloud).points)
@@ -221,12 +218,11 @@ def crop_linked(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -
         votes = vote(near.points, masked, pose, settings.min_votes)
         print(f"{votes.object.sum()} of {len(scene)} scene points by the votes of the masks", flush=True)
         marks, other = np.concatenate([near.points[votes.object], votes.own]), votes.other
-        voted = int(votes.object.sum())
     cut = crop_cloud(near, marks, UP, settings, other)
     points, clicked = _checked(scene, inputs, settings, cut)
     cut = replace(cut, notes=[f"marked by {by} through the alignment from shared features", *clicked, *cut.notes])
     _announce(cut, str(source))
-    return near, cut, Marks(mode, points, voted)
+    return near, cut, Marks(mode, points)
 
 
 def _checked(scene: TiledCloud, inputs: CropInputs, settings: CropSettings, cut: Crop) -> tuple[Array, list[str]]:

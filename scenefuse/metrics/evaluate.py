@@ -279,8 +279,6 @@ class EvaluationInputs:
     """Folder of masks of the undistorted photos, where there are some."""
     stages: tuple[Path, ...] = ()
     """Folders that hold depth_maps/, in order; none where the cloud was given."""
-    alignment_json: Path | None = None
-    """JSON of the alignment from shared features, measured like a variant, or nothing."""
     scene: Path | None = None
     """Scene cloud before fusion, scene frame."""
     fused: Path | None = None
@@ -325,9 +323,6 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, sample
 
     variants = {path.parent.name: errors_of(path) for path in inputs.variants}
     result |= next(iter(variants.values()), {})
-    if inputs.alignment_json is not None:
-        errors = errors_of(inputs.alignment_json)
-        result |= {f"alignment_{name}": entry for name, entry in errors.items() if name != "status"}
     flight = truth.read_cameras(inputs.truth_scene / "cameras.json")
     surface = surface_to_find(known, flight)
     for when, cloud in _around_object(inputs, known, truth_from_scene).items():

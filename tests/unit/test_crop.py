@@ -246,7 +246,7 @@ def test_stage_crops_by_masks_as_by_clicks(orbit, tmp_path):
     voted, report = read_cloud(files["crop"]).points, read_json(files["report"])
     both = len({*map(tuple, clicked)} & {*map(tuple, voted)})
     assert both > 0.9 * max(len(clicked), len(voted))
-    assert value(report, "mode") == "masks" and value(report, "voted_points") > 4000
+    assert value(report, "mode") == "masks"
     assert value(report, "fiducials") == [] and value(report, "ground_points") > 0
 
 

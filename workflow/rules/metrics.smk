@@ -108,7 +108,6 @@ rule evaluate_object:
             variant=VARIANTS,
             allow_missing=True,
         ),
-        alignment="results/objects/{object}/alignment.json",
         scene=in_scene("dense.ply"),
         fused="results/objects/{object}/fused.ply",
         checked="results/objects/{object}/checked.ply",
@@ -135,6 +134,6 @@ rule evaluate_object:
         "{wildcards.object}: comparing with the truth"
     shell:
         "exec python {params.script} --workspace {input.workspace} --sparse {input.sparse} --undistorted {input.undistorted}"
-        " {params.made} --cloud {input.cloud} --variants {input.variants} --alignment-json {input.alignment} --scene {input.scene} --fused {input.fused}"
+        " {params.made} --cloud {input.cloud} --variants {input.variants} --scene {input.scene} --fused {input.fused}"
         " --checked {input.checked} --scene-json {input.scene_json} --truth-scene {input.truth[0]:q} --truth-object {input.truth[1]:q}"
         " --report {output} --seed {params.seed} &> {log}"
