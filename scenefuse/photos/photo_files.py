@@ -42,9 +42,9 @@ DAMAGED = (
 
 # Where servers and systems keep thumbnails and what was deleted.
 SYSTEM_FOLDERS = ("@eadir", "#recycle", "$recycle.bin", "__macosx")
-# Where in a folder other programs keep cameras, and under which names.
-CAMERA_FILES = ["transforms.json", "transforms_train.json", "transforms_test.json"]
-CAMERA_FILES += ["reconstruction.json", "opensfm/reconstruction.json"]
+# Where in a folder other programs keep cameras, and under which names; Blender keeps some apart.
+CAMERA_FILES = ("reconstruction.json", "opensfm/reconstruction.json", "transforms.json", "transforms_train.json")
+HELD_OUT_FILE = "transforms_test.json"
 MODEL_FILES = tuple(f"{name}.{kind}" for name in ("cameras", "images") for kind in ("bin", "txt"))
 BUNDLER = ".out"
 # Where in an OpenDroneMap project its place on the earth is.
@@ -64,7 +64,7 @@ def camera_files(given: Path) -> list[Path]:
         return [given, *([listed] if listed else []), *([coords] if coords.is_file() else [])]
     exported = [file for export in exports(given) for file in camera_files(export)]
     models = [model / name for model in colmap_models(given) for name in MODEL_FILES]
-    places = [given / name for name in [*CAMERA_FILES, COORDS]]
+    places = [given / name for name in (*CAMERA_FILES, HELD_OUT_FILE, COORDS)]
     return [file for file in [*models, *places] if file.is_file()] or exported or [given]
 
 

@@ -15,12 +15,9 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines, read_text
 from scenefuse.core.transforms import Sim3
 from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, check_crs, colmap_camera
-from scenefuse.photos.photo_files import COORDS, files_by_name, stored_size
+from scenefuse.photos.photo_files import COORDS, HELD_OUT_FILE, files_by_name, stored_size
 
 TRANSFORMS = {"transforms.json": "nerfstudio", "transforms_train.json": "Blender"}
-FILE = "reconstruction.json"
-# Where an OpenDroneMap project has it.
-PLACES = (FILE, f"opensfm/{FILE}")
 # What an OpenDroneMap project that lies on the earth has beside it.
 TOPOCENTRIC = "reconstruction.topocentric.json"
 # What describes a camera, of a frame or of all of them.
@@ -40,7 +37,7 @@ def read_transforms(file: Path) -> list[GivenCamera]:
         ValueError, TypeError: the file is no such JSON.
     """
     photos = _read(file, False)
-    test = file.with_name("transforms_test.json")
+    test = file.with_name(HELD_OUT_FILE)
     return photos + (_read(test, True) if file.name == "transforms_train.json" and test.is_file() else [])
 
 
@@ -124,11 +121,6 @@ def _pose(matrix: Any, where: str) -> NDArray[np.float64]:
     pose[:3] = given[:3]
     pose[:3, :3] = pose[:3, :3] @ FLIP
     return pose
-
-
-def find_opensfm(data: Path) -> Path | None:
-    """The reconstruction.json of a folder; None where there is none."""
-    return next((data / place for place in PLACES if (data / place).is_file()), None)
 
 
 def read_opensfm(file: Path) -> dict[str, list[GivenCamera]]:

@@ -17,10 +17,11 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines, read_text
 from scenefuse.core.transforms import Array
 from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, PosedPhoto, colmap_camera, largest
-from scenefuse.photos.cameras.json_cameras import TRANSFORMS, find_opensfm, opensfm_place, read_opensfm, read_transforms
+from scenefuse.photos.cameras.json_cameras import TRANSFORMS, opensfm_place, read_opensfm, read_transforms
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
 from scenefuse.photos.photo_files import (
     BUNDLER,
+    CAMERA_FILES,
     DAMAGED,
     bundler_list,
     colmap_models,
@@ -109,11 +110,9 @@ def _format_of(cameras: Path) -> tuple[Path, str]:
         raise StageError(f"the cameras {cameras} do not exist; correct the path")
     if cameras.is_file():
         return cameras, _program_of(cameras)
-    if (file := find_opensfm(cameras)) is not None:
-        return file, "OpenSfM"
-    for name, program in TRANSFORMS.items():
+    for name in CAMERA_FILES:
         if (cameras / name).is_file():
-            return cameras / name, program
+            return cameras / name, _program_of(cameras / name)
     if colmap_models(cameras):
         return cameras, "COLMAP"
     found = exports(cameras)
