@@ -130,8 +130,8 @@ def open_cloud(path: Path) -> TiledCloud:
         StageError: the file is missing, cut short, or not as this project writes clouds.
     """
     path = Path(path)
-    elements, offset = read_header(path) or ([], 0)
-    row, count = (elements[0].row, elements[0].count) if elements else (None, 0)
+    elements, offset, is_text = read_header(path)
+    row, count = (elements[0].row, elements[0].count) if elements and not is_text else (None, 0)
     if row is None or not {"x", "y", "z"} <= set(row.names or ()):
         raise StageError(f"{path} is no cloud that a stage of this project wrote; delete it and rerun its stage")
     check_size(path, elements, offset, "delete it and rerun the stage that writes it")

@@ -60,18 +60,12 @@ class Element:
     kinds: dict[str, str] = field(default_factory=dict)
 
 
-def read_header(path: Path) -> tuple[list[Element], int] | None:
-    """The elements of a binary PLY and the byte where their rows begin; None where the file is text or no PLY.
+def read_header(path: Path) -> tuple[list[Element], int, bool]:
+    """Elements, the byte where their rows begin, and whether these are text; no elements where it is no PLY.
 
     Raises:
         StageError: the file does not exist.
     """
-    elements, offset, is_text = _header(path)
-    return None if is_text or not elements else (elements, offset)
-
-
-def _header(path: Path) -> tuple[list[Element], int, bool]:
-    """Elements, the byte where their rows begin, and whether these are text; no elements where it is no PLY."""
     if not path.is_file():
         raise StageError(f"{path} does not exist; run the stage that writes it first")
     orders = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
@@ -85,7 +79,7 @@ def _header(path: Path) -> tuple[list[Element], int, bool]:
 
 def in_rows(path: Path) -> bool:
     """Whether the points of a PLY come first, without lists, and are no corners of faces."""
-    elements = _header(path)[0]
+    elements = read_header(path)[0]
     mesh = any(element.name in (FACES, STRIPS) and element.count for element in elements)
     return bool(elements) and elements[0].name == "vertex" and elements[0].row is not None and not mesh
 
@@ -98,7 +92,7 @@ def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
         StageError: the file is cut short, or a row of text is of another length.
         ValueError: it is no PLY, or has no vertices.
     """
-    elements, offset, is_text = _header(path)
+    elements, offset, is_text = read_header(path)
     if not elements:
         raise ValueError("it does not begin as PLY does")
     if not is_text:
