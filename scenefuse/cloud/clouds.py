@@ -25,7 +25,6 @@ from scenefuse.cloud.readers.columns import (
     joined,
     positions,
 )
-from scenefuse.cloud.readers.las import ENDINGS, LAS_DIMENSIONS, WITHHELD
 from scenefuse.cloud.readers.ply import Element, header_of
 from scenefuse.core.stage import StageError, atomic_file, threads
 from scenefuse.core.transforms import Sim3
@@ -197,7 +196,7 @@ def sampled_rows(count: int, most: int, seed: int) -> NDArray[np.int64]:
 def read_cloud(path: Path) -> Cloud:
     """Read PLY, LAS, LAZ, E57, PCD, text (XYZ, PTS, TXT, ASC, CSV), or a mesh (PLY, OBJ, glTF) as points on its faces.
 
-    Rows without a finite position are left out; so are the classes and the like of LAS, and colours that are all black.
+    Rows without a finite position are left out. `CloudFile` has more of what a user's file may need.
 
     Raises:
         StageError: the file is missing, damaged, of an unknown ending, or holds no points.
@@ -211,10 +210,6 @@ def read_cloud(path: Path) -> Cloud:
         print(f"{path}: {left_out} of {count} rows have no finite position and are left out", flush=True)
         if left_out == count:
             raise StageError(f"{path} holds no point with a finite position; look at what wrote it")
-    if path.suffix.lower() in ENDINGS:
-        black = set(COLOR) <= set(columns) and not any(columns[name].any() for name in COLOR)
-        beside = {*LAS_DIMENSIONS, WITHHELD, *(COLOR if black else ())}
-        columns = {name: values for name, values in columns.items() if name not in beside}
     return cloud_of(columns)
 
 
