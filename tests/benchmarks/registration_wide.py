@@ -71,10 +71,12 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     for (times, method), part in rows.groupby(["times", "method"], sort=False):
         there, absent = part[~part.absent], part[part.absent]
         lines.append({
-            "times_as_wide": times, "method": method, "trials": len(there),
-            "right": (there.right & there.accepted).sum(), "right_but_refused": (there.right & ~there.accepted).sum(),
-            "wrong_but_accepted": (~there.right & there.accepted).sum(),
-            "absent": len(absent), "absent_but_accepted": absent.accepted.sum(), "cpu_s": round(part.cpu_s.median(), 1),
+            "landscape, times as wide as the object": times, "method": method, "trials": len(there),
+            "right and accepted": (there.right & there.accepted).sum(),
+            "right, refused": (there.right & ~there.accepted).sum(),
+            "wrong, accepted": (~there.right & there.accepted).sum(),
+            "object absent": len(absent), "absent, accepted": absent.accepted.sum(),
+            "seconds of one core": round(part.cpu_s.median()),
         })  # fmt: skip
     return pd.DataFrame(lines)
 
