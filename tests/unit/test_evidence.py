@@ -22,10 +22,10 @@ from scenefuse.geometry.surface import prepare
 NOBODY = pack([])
 
 
-def sheet(low, high, step, noise=0.0, z=0.0):
-    """Points of the plane, x and y from low to high, with noise along z."""
+def sheet(low, high, step, noise=0.0, z=0.0, half=0.6):
+    """Points of the plane, x from low to high, y from -half to half, with noise along z."""
     rng = np.random.default_rng(0)
-    x, y = np.meshgrid(np.arange(low, high, step), np.arange(-1, 1, step))
+    x, y = np.meshgrid(np.arange(low, high, step), np.arange(-half, half, step))
     points = np.stack([x.ravel(), y.ravel(), z + noise * rng.normal(size=x.size)], axis=1)
     colors = np.full((len(points), 3), 120, np.uint8)
     return Cloud(points, np.tile(np.array([0, 0, 1], np.float32), (len(points), 1)), colors)
@@ -90,9 +90,9 @@ def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_
 
 def test_what_close_ups_show_and_do_not_confirm_beside_the_object_goes_though_the_flight_confirms_it(near):
     flight = pack(photographs(8, 9.0, radius=6.0))
-    obj, floating = sheet(-1.0, 0.0, 0.01), sheet(0.01, 0.02, 0.01, z=0.037)
+    obj, floating = sheet(-1.0, 0.0, 0.01, half=1), sheet(0.01, 0.02, 0.01, z=0.037, half=1)
     floating = floating[np.abs(floating.points[:, 1]) < 0.5]
-    scene = concatenate([sheet(-0.2, 0.4, 0.01), floating])
+    scene = concatenate([sheet(-0.2, 0.4, 0.01, half=1), floating])
     found = check(obj, scene, near, flight, nerf_only=False)
     last = np.arange(len(scene)) >= len(scene) - len(floating)
     gone = found.reason == Reason.DISPUTED
@@ -309,7 +309,7 @@ def test_a_scene_of_which_nothing_is_measured_gives_way(near, far):
 
 @pytest.mark.parametrize(("inexact", "stay"), [(0.02, True), (0.004, False)])
 def test_what_the_scene_did_not_measure_stays_where_the_object_measures_less_exactly(inexact, stay):
-    obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04, z=0.01)
+    obj, scene = sheet(-0.8, 0.8, 0.03, half=1), sheet(-0.8, 0.8, 0.04, z=0.01, half=1)
     measured = scene.points[:, 0] < 0
     theirs = known(scene, np.where(measured, 0.005, np.inf), measured)
     worse, better = better_measured(known(obj, inexact), theirs, obj.diagonal, 1.0)

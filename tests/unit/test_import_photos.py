@@ -442,6 +442,7 @@ def sphere_on_disk(root):
     return root
 
 
+@pytest.mark.slow
 def test_a_sphere_from_the_files_to_its_cloud_and_a_nerf_without_a_cloud(tmp_path, quick, monkeypatch):
     data, out = sphere_on_disk(tmp_path / "in"), tmp_path / "out"
     trained = {"data": data, "out": out, "masks": data / "masks", "config": quick, "epochs": 3}

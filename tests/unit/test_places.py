@@ -18,8 +18,8 @@ from scenefuse.register.register import Registration, RegistrationSettings, find
 from scenefuse.register.score import Hypothesis, Score
 
 LITTLE = RegistrationSettings(
-    coarse=CoarseSettings(ransac_samples=10000, candidates=8, keep=2),
-    fine=FineSettings(voxel_fraction=0.012, turn_steps=8),
+    coarse=CoarseSettings(ransac_samples=5000, feature_scale_steps=1, scale_steps=5, candidates=6, keep=2),
+    fine=FineSettings(voxel_fraction=0.02, turn_steps=6),
 )
 
 
@@ -42,6 +42,7 @@ def test_one_of_the_likely_places_is_the_object_without_its_ground(yard):
     assert np.linalg.norm(np.ptp(yard.scene.points[nearest], axis=0)) < 1.3 * yard.diagonal
 
 
+@pytest.mark.slow
 def test_a_house_is_found_in_a_landscape_ten_times_as_wide(yard):
     found, part, places = find_in_scene(yard.object, yard.scene, LITTLE, 0, up_in_scene=UP)
     assert found.registered, found.reason

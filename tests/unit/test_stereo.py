@@ -14,7 +14,7 @@ WIDTH, HEIGHT, FOCAL = 200, 160, 180.0
 CARD, WALL = 8.0, 11.0
 HALF = (1.5, 1.2)
 CENTRES = [(0, 0), (1.0, 0.1), (-1.0, -0.1), (0.1, 1.0), (-0.1, -1.0), (0.8, -0.7), (-0.8, 0.7)]
-SETTINGS = DepthMapSettings(planes=64)
+SETTINGS = DepthMapSettings(planes=64, window_px=5)
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])
 
 
