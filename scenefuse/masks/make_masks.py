@@ -1,5 +1,5 @@
 """Masks of the object in every photo: by GrabCut or SAM 2 from prompts, or those that a person supplies for the
-original photos, moved into the undistorted ones; all checked by their visual hull."""
+original photos, moved into the undistorted ones; what of them `keep` keeps; all checked by their visual hull."""
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -24,6 +24,7 @@ from scenefuse.core.stage import (
 )
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.clicks import read_points
+from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.prompts import overlap
 from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.sam2_weights import WEIGHTS, why_unavailable
@@ -70,6 +71,7 @@ def make_masks(
     each photo, whose masks carve a visual hull, along which they are cut again. SAM 2 is prompted in each photo with
     all points and the box around them, and again with the hull's box where it disagrees. Supplied masks are
     undistorted, never changed. A photo without a usable mask, or whose mask disagrees with the hull, is left out.
+    `keep` is applied last.
 
     Args:
         inputs: see MaskInputs.
@@ -106,7 +108,7 @@ def make_masks(
             write_picture(folder / f"{Path(name).stem}.png", made.masks[name].astype(np.uint8) * 255)
     with atomic_file(contact_sheet) as path:
         write_picture(path, _contact_sheet(photos.views, made))
-    content = _report(made, found, len(photos.views), kept) | by
+    content = _report(made, found, len(photos.views), kept, settings) | by
     print(f"{len(kept)} of {len(photos.views)} masks, median agreement {value(content, 'median_agreement'):.3f}")
     write_json(report, content)
 
@@ -150,7 +152,8 @@ def _make(
             " part of the object, or hold more than it; look at them, and click in a photo where they are wrong"
         )
         found = replace(found, notes=(*found.notes, note))
-    return replace(scored, dropped=unusable | scored.dropped), found, by
+    made = _kept(scored, settings.keep, inputs.sparse, photos.views)
+    return replace(made, dropped=unusable | made.dropped), found, by
 
 
 def _least_clicked(scored: ScoredMasks, found: Prompted) -> float:
@@ -199,6 +202,20 @@ def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Worksp
     return [found[view.name] for view in photos.views], photos, missing | unusable
 
 
+def _kept(made: ScoredMasks, keep: str, sparse: Path, views: list[View]) -> ScoredMasks:
+    """The part of the masks that an expression keeps; their agreement stays that of the whole object."""
+    masks, dropped, others = {}, dict(made.dropped), {}
+    for folder in mask_folders(keep):
+        others[folder], unusable = supplied_masks(folder, sparse, views)
+        dropped = unusable | dropped
+    for name, mask in made.masks.items():
+        here = {folder: found[name] for folder, found in others.items() if name in found}
+        masks[name] = kept_part(keep, mask, here)
+        if not masks[name].any():
+            dropped.setdefault(name, f"nothing is left of the mask ({keep})")
+    return replace(made, masks=masks, dropped=dropped)
+
+
 def _contact_sheet(views: list[View], made: ScoredMasks) -> NDArray[np.uint8]:
     """(H, W, 3) RGB, all masks for a person to check in ten seconds: the background dimmed, the outline green, or red
     where the photo is left out, and the mask's agreement with the hull beside its name."""
@@ -223,7 +240,7 @@ def _contact_sheet(views: list[View], made: ScoredMasks) -> NDArray[np.uint8]:
     return sheet
 
 
-def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str]) -> dict[str, Any]:
+def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str], settings: MaskSettings) -> dict[str, Any]:
     """What the stage found."""
     per_photo = {
         name: {"area": round(float(mask.mean()), 5), "agreement": round(float(made.scores[name]), 4)}
@@ -231,6 +248,7 @@ def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str]) ->
         for name, mask in made.masks.items()
     }
     return {
+        "keep": quantity(settings.keep, ""),
         "masks": quantity(len(kept), "1"),
         "photos": quantity(photos, "1"),
         "photos_left_out": quantity(sorted(made.dropped), ""),
@@ -256,7 +274,9 @@ def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[
         StageError: no such folder, masks that belong to none of the photos, or none that is usable.
     """
     if not folder.is_dir():
-        raise StageError(f"the folder of masks {folder} does not exist; set its path in config/objects.tsv")
+        raise StageError(
+            f"the folder of masks {folder} does not exist; set its path in config/objects.tsv, or in object.masks.keep"
+        )
     files, originals = masks_by_name([view.name for view in views], folder), read_cameras(sparse)
     masks: dict[str, Mask] = {}
     unusable: dict[str, str] = {}

@@ -48,6 +48,10 @@ class MaskSettings:
     method: Literal["auto", "sam2", "grabcut", "supplied"] = setting("auto")
     """Where masks come from: SAM 2, GrabCut, or (`auto`) SAM 2, and GrabCut where its weights cannot be fetched. A
     folder in the column `masks` of the objects' table goes before."""
+    keep: str = setting("object")
+    """What the masks keep: `object`, or an expression with folders of other masks in quotes, `and`, `or`, `not` and
+    brackets. `{object}` in a folder stands for the object's name. Masks are named like the photos; a photo without one
+    shows nothing of that."""
     min_agreement: float = 0.6
     """Smallest IoU of a mask with the hull's outline; below it the photo is left out."""
     max_click_residual_px: float = setting(4, unit="px", least=0)

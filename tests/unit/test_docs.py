@@ -189,7 +189,9 @@ def test_what_is_gone_is_noticed(tmp_path):
     assert missing_paths(text) == ["scenefuse/gone.py"]
     assert missing_scripts(text) == ["scripts/gone.py"]
     assert missing_settings(text) == ["config/gone.yaml"]
-    text = "`object.masks.gone`, `fusion.mode`, `object.ply`, `object: { gone: 1 }`, `object: { hold_out_every: 8 }`"
+    text = (
+        "`object.masks.gone`, `object.masks.keep`, `object.ply`, `object: { gone: 1 }`, `object: { hold_out_every: 8 }`"
+    )
     assert missing_keys(text) == ["object.masks.gone", "object: { gone: 1 }"]
 
 

@@ -18,6 +18,7 @@ from scenefuse.geometry.visual_hull import carve, mask_iou, silhouette
 from scenefuse.marks.clicks import read_points
 from scenefuse.marks.triangulation import marked_size
 from scenefuse.masks import make_masks as masks_module
+from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.grabcut import cleaned, second_trimap, stamp
 from scenefuse.masks.make_masks import MaskInputs, make_masks
 from scenefuse.masks.sam2 import check_weights, segment
@@ -426,6 +427,57 @@ def test_wrong_or_missing_weights_are_named(tmp_path):
     with pytest.raises(StageError, match="have SHA-256"):
         check_weights(weights, "0" * 64)
     check_weights(weights, sha256(weights))
+
+
+def test_masks_keep_what_the_expression_says(capture, tmp_path):
+    left = np.zeros((HEIGHT, WIDTH), np.uint8)
+    left[:, : WIDTH // 2] = 255
+    (tmp_path / "left").mkdir()
+    for k in range(PHOTOS - 1):
+        cv2.imwrite(str(tmp_path / "left" / f"f{k}.png"), left)
+    run_stage(capture, tmp_path / "all")
+    run_stage(capture, tmp_path / "part", keep=f"object and not '{tmp_path}/left'")
+    for k in range(PHOTOS):
+        whole, part = (cv2.imread(str(tmp_path / n / "masks" / f"f{k}.png"), 0) > 0 for n in ("all", "part"))
+        assert np.array_equal(part, whole if k == PHOTOS - 1 else whole & (left == 0))
+    report = read_json(tmp_path / "part" / "masks.json")
+    assert report["median_agreement"] == read_json(tmp_path / "all" / "masks.json")["median_agreement"]
+
+
+def test_a_photo_of_which_nothing_is_kept_is_left_out(capture, tmp_path):
+    (tmp_path / "glass").mkdir()
+    cv2.imwrite(str(tmp_path / "glass" / "f3.png"), np.full((HEIGHT, WIDTH), 255, np.uint8))
+    run_stage(capture, tmp_path, keep=f"not '{tmp_path}/glass' and object")
+    assert not (tmp_path / "masks" / "f3.png").exists()
+    assert read_json(tmp_path / "masks.json")["dropped"]["f3.png"].startswith("nothing is left of the mask")
+
+
+def test_a_photo_whose_other_mask_cannot_be_read_is_left_out(capture, tmp_path):
+    (tmp_path / "sky").mkdir()
+    cv2.imwrite(str(tmp_path / "sky" / "f2.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    (tmp_path / "sky" / "f3.png").write_bytes(b"no picture")
+    run_stage(capture, tmp_path, keep=f"object and not '{tmp_path}/sky'")
+    report = read_json(tmp_path / "masks.json")
+    assert value(report, "masks") == PHOTOS - 1 and "f3.png cannot be read" in report["dropped"]["f3.png"]
+    assert not (tmp_path / "masks" / "f3.png").exists()
+
+
+def test_mask_algebra():
+    own, sky, tree = (np.array(bits, bool) for bits in ([1, 1, 1, 0], [0, 1, 0, 0], [0, 0, 1, 1]))
+    others = {Path("sky"): sky, Path("tree"): tree}
+    assert kept_part("object", own, others).tolist() == [1, 1, 1, 0]
+    assert kept_part("object and not ('sky' or 'tree')", own, others).tolist() == [1, 0, 0, 0]
+    assert kept_part("object and not 'sky' or 'tree'", own, others).tolist() == [1, 0, 1, 1]
+    assert kept_part("object and not 'sea'", own, others).tolist() == [1, 1, 1, 0]
+    assert mask_folders("object and not ('sky' or 'data/tree')") == [Path("sky"), Path("data/tree")]
+
+
+@pytest.mark.parametrize(
+    "keep", ["", "object and", "objct", "object - 'sky'", "object and not sky", "f('sky')", "-object"]
+)
+def test_mask_algebra_that_cannot_be_read_is_named(keep):
+    with pytest.raises(StageError, match="object.masks.keep cannot be read: .* write object, folders"):
+        mask_folders(keep)
 
 
 def registry(folder, networks, monkeypatch):

@@ -1,13 +1,27 @@
 # What masks are made from, and how.
+from scenefuse.masks.algebra import mask_folders
 from scenefuse.masks.sam2_weights import WEIGHTS
 
 
+def kept_masks(wildcards):
+    """What an object's masks keep."""
+    keep = settings_of(wildcards)["object"]["masks"]["keep"]
+    return keep.replace("{object}", wildcards.object)
+
+
 def mask_inputs(wildcards):
-    """What the masks of an object are made from: your own masks, or prompts and perhaps weights."""
+    """What the masks of an object are made from: your own masks, or prompts and perhaps weights; masks to combine."""
     row = object_row(wildcards.object)
+    settings = settings_of(wildcards)["object"]["masks"]
     photos_of(row, f"object '{wildcards.object}'")
+    try:
+        folders = mask_folders(kept_masks(wildcards))
+    except StageError as error:
+        refuse(str(error))
+    where = f"object.masks.keep of '{wildcards.object}'"
+    files = [file for folder in folders for file in photos_in(str(folder), where)]
     if row.get("masks"):
-        return photos_in(
+        return files + photos_in(
             row["masks"], f"{config['objects']}, masks of '{wildcards.object}'"
         )
     if not row.get("prompts"):
@@ -15,9 +29,9 @@ def mask_inputs(wildcards):
             f"{config['objects']}: '{wildcards.object}' has neither prompts nor masks; fill one of these columns"
         )
     check_clicks(wildcards.object, "prompts")
-    by_network = settings_of(wildcards)["object"]["masks"]["method"] in ("auto", "sam2")
-    weights = [WEIGHTS] if by_network else []
-    return weights + own_file("object", wildcards.object, "prompts")
+    if settings["method"] in ("auto", "sam2"):
+        files.append(WEIGHTS)
+    return files + own_file("object", wildcards.object, "prompts")
 
 
 def mask_options(wildcards):
@@ -25,6 +39,7 @@ def mask_options(wildcards):
     row = object_row(wildcards.object)
     settings = settings_of(wildcards)["object"]["masks"]
     own = {
+        "keep": kept_masks(wildcards),
         "supplied": row.get("masks") or None,
         "prompts": None if row.get("masks") else row.get("prompts") or None,
     }
