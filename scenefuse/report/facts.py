@@ -27,6 +27,8 @@ LOOKED_AT = 20
 # Others look before as after.
 ADDED = ("registered", "ungated")
 DONE = (*ADDED, ALONE)
+# Between the pieces of advice in a cell of objects.tsv.
+BETWEEN = " | "
 # A wider angle without any photo leaves a side of the object unseen.
 MAX_GAP_DEG = 100.0
 # Masks are mentioned where more than this share of the photos is left out, or where the others agree by less (IoU).
@@ -124,7 +126,7 @@ def accuracies(row: Row) -> list[str]:
 
 
 def _next(has: dict[str, Any]) -> dict[str, str]:
-    """What to photograph, click or repair."""
+    """What to photograph, click or repair, a line each."""
     parts = []
     if has.get("stations"):
         shows = (
@@ -136,8 +138,8 @@ def _next(has: dict[str, Any]) -> dict[str, str]:
         table = f"results/objects/{has['object']}/next_photos.csv"
         parts.append(f"photograph it from {has['stations']:.0f} {places} ({table}){shows}")
     if "advice" in has:
-        parts.append(has["advice"])
-    return {"Next": "; ".join(parts)} if parts else {}
+        parts += has["advice"].split(BETWEEN)
+    return {"Next": "\n".join(part[:1].upper() + part[1:] for part in parts)} if parts else {}
 
 
 def scene_facts(row: Row) -> dict[str, str]:
@@ -222,16 +224,24 @@ def closing_lines(summary: Path) -> str:
     ]
     # First what is not done, then what could be better.
     steps = [f"{row['object']}: {object_facts(row)['Result']}" for row in objects if row not in done]
-    steps += [f"{row['object']}: {facts['Next']}" for row in done if "Next" in (facts := object_facts(row))]
+    found = {row["object"]: object_facts(row).get("Next", "") for row in done}
+    steps += [f"{name}: {step}" for name, text in found.items() for step in text.splitlines()]
     page = summary / "report.html"
     return "\n".join(
         [
             f"Result: {len(done)} of {len(objects)} objects completed"
             + (f"; {', '.join(map(str, files))}" if files else ""),
             f"Report: {page if page.is_file() else summary / 'summary.txt'}",
-            f"Next:   {steps[0] if steps else 'nothing is missing; open the result in CloudCompare or QGIS'}",
+            f"Next:   {_first(steps)}",
         ]
     )
+
+
+def _first(steps: list[str]) -> str:
+    """The first of some steps, and that there are more."""
+    if not steps:
+        return "nothing is missing; open the result in CloudCompare or QGIS"
+    return steps[0] + (f" ({len(steps) - 1} more in the report)" if len(steps) > 1 else "")
 
 
 def photographed(photos_json: Path, folder: Path) -> str | None:

@@ -98,8 +98,11 @@ def _facts(facts: dict[str, str]) -> str:
     def link(file: re.Match[str]) -> str:
         return f'<a href="../{file[1]}">{file[0].replace("/", "/<wbr>")}</a>'
 
-    linked = {label: re.sub(r"results/([\w./-]*\w)", link, escape(text)) for label, text in facts.items()}
-    return f"<dl>{''.join(f'<div><dt>{k}</dt><dd>{text}</dd></div>' for k, text in linked.items())}</dl>"
+    def said(text: str) -> str:
+        lines = re.sub(r"results/([\w./-]*\w)", link, escape(text)).splitlines()
+        return lines[0] if len(lines) == 1 else f"<ul>{''.join(f'<li>{line}</li>' for line in lines)}</ul>"
+
+    return f"<dl>{''.join(f'<div><dt>{label}</dt><dd>{said(text)}</dd></div>' for label, text in facts.items())}</dl>"
 
 
 def _folded(title: str, content: str) -> str:

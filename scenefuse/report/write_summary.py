@@ -15,6 +15,7 @@ import yaml
 from scenefuse.core.stage import atomic_file
 from scenefuse.core.version import VERSION
 from scenefuse.report.facts import (
+    BETWEEN,
     accuracies,
     diagnose,
     ground_pixel,
@@ -183,7 +184,7 @@ def objects_table(run: RunSummary, inputs: RunInputs) -> pd.DataFrame:
             | {"scene_scale_sd_log": _scale_sd(scenes.get(scene, {}))}
             | {"photographed": photographed(folder / "photos.json", folder / "frames")}
             | {"missing": item.missing or None, "error": why_missing(item.failed) if item.missing else None}
-            | {"advice": "; ".join(diagnose(item)) or None}
+            | {"advice": BETWEEN.join(diagnose(item)) or None}
         )
     return pd.DataFrame(rows)
 
@@ -252,7 +253,7 @@ def _heading(text: str) -> list[str]:
 def _line(label: str, text: str, most: int | None = None) -> list[str]:
     """`label   text`, wrapped, continuation lines indented; `most` is how many lines there may be."""
     wrapper = textwrap.TextWrapper(WIDTH, f"{label:<14}", " " * 14, max_lines=most, placeholder=" ... (details.txt)")
-    return wrapper.wrap(text)
+    return wrapper.wrap(text.replace("\n", ". "))
 
 
 def _pairs(*cells: Cell) -> str:

@@ -554,6 +554,9 @@ def test_a_long_advice_is_cut_in_summary_and_whole_in_details(results):
     short, long = ((summary / f"{name}.txt").read_text().split("object balloon")[0] for name in ("summary", "details"))
     lines = short[short.index("Next  ") :].strip().splitlines()
     assert len(lines) == 2 and lines[-1].endswith("... (details.txt)")
+    write_json(results / "objects/house/missing.json", {"stations": quantity(2, "")})
+    first = "Next:   house: Photograph it from 2 places (results/objects/house/next_photos.csv) (1 more in the report)"
+    assert closing_lines(summarise(results, ["house"])).splitlines()[-1] == first
     assert "photograph the steps between" in " ".join(long.split()) and "details.txt" not in long
 
 
