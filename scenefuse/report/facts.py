@@ -61,9 +61,8 @@ def object_facts(row: Row) -> dict[str, str]:
         absolute = "; that is relative: on Earth it is known as well as the scene (see Position)"
         facts["Accuracy"] = found[0] + (absolute if "crs" in has else "")
     if "scale_sd_log" in has:
-        of_scene = has.get("scene_scale_sd_log")
-        known = _of_lengths(math.hypot(has["scale_sd_log"], of_scene or 0.0), unit)
-        facts["Lengths"] = known + (", plus the deviation of both ends" if of_scene else ", beside the scene's")
+        ends = ", plus the deviation of both ends" if has.get("scene_scale_sd_log") else ", beside the scene's"
+        facts["Lengths"] = _of_lengths(scale_sd(row), unit) + ends
     if "registered" in has and "frames" in has:
         facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used"
         facts["Photos"] += f", taken {has['photographed']}" if "photographed" in has else ""
@@ -73,6 +72,12 @@ def object_facts(row: Row) -> dict[str, str]:
     elif status == ALONE:
         facts["File"] = f"{folder}/object.ply (a frame of its own, {_plural(unit)})"
     return _capital(facts | _next(has))
+
+
+def scale_sd(row: Row) -> float:
+    """Relative standard deviation of an object's lengths by its scale and, where that is known, the scene's."""
+    has = _known(row)
+    return math.hypot(has.get("scale_sd_log", 0.0), has.get("scene_scale_sd_log", 0.0))
 
 
 def _plural(unit: str) -> str:
@@ -163,7 +168,8 @@ def scene_facts(row: Row) -> dict[str, str]:
     if "latitude_deg" in has:
         north, east = has["latitude_deg"], has["longitude_deg"]
         place = f"{abs(north):.5f}° {'NS'[north < 0]}, {abs(east):.5f}° {'EW'[east < 0]}"
-        facts["Place"] = f"{place}; from there the local frame counts metres east, north and up"
+        above = f", {has['altitude_m']:,.1f} m high as the positions count it" if "altitude_m" in has else ""
+        facts["Place"] = f"{place}{above}; from there the local frame counts metres east, north and up"
     if found := accuracies(row):
         facts["Position"] = f"absolute, where on Earth the scene lies: {found[0]}"
     if "gps_scale_sd_log" in has:

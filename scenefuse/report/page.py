@@ -67,7 +67,7 @@ def figure(path: Path, caption: str) -> str:
     return f'<figure class="sheet">{picture}<figcaption>{escape(caption)}</figcaption></figure>'
 
 
-def view_section(key: str, name: str, view: View, mesh: ViewMesh | None = None) -> str:
+def view_section(key: str, name: str, view: View, mesh: ViewMesh | None = None, scale_sd: float = 0.0) -> str:
     """One 3D view: stage, buttons, legend, its points and its mesh.
 
     Args:
@@ -75,8 +75,10 @@ def view_section(key: str, name: str, view: View, mesh: ViewMesh | None = None) 
         name: of what it shows, for labels.
         view: the points; few enough for a page.
         mesh: of the completed object in the view's frame.
+        scale_sd: relative standard deviation of lengths by the scale, as far as it is known.
     """
     about, planes = encode(view)
+    about["scale_sd"] = scale_sd
     deviations = about.get("deviation")
     about["modes"] = modes = _modes(view, deviations)
     buttons = {mode["name"]: mode["button"] for mode in modes}

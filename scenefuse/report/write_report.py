@@ -11,7 +11,7 @@ import pandas as pd
 import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scene_facts, surface_facts
+from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scale_sd, scene_facts, surface_facts
 from scenefuse.report.page import document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
 from scenefuse.report.values import WORDS, asset, number, read_table
@@ -120,7 +120,7 @@ def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str
     parts.append(f'<div class="pair">{"".join(pictures)}{_facts(facts)}</div>')
     if view is not None and is_finished:
         mesh = read_mesh(folder, view.unit)
-        parts.append(view_section(f"object-{folder.name}", folder.name, view, mesh))
+        parts.append(view_section(f"object-{folder.name}", folder.name, view, mesh, scale_sd(row)))
     elif status in texts["no_view"]:
         parts.append(f"<p>{texts['no_view'][status]}</p>")
     if is_finished and (figures / "missing.png").is_file():

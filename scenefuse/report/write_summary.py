@@ -252,7 +252,7 @@ def _heading(text: str) -> list[str]:
 
 def _line(label: str, text: str, most: int | None = None) -> list[str]:
     """`label   text`, wrapped, continuation lines indented; `most` is how many lines there may be."""
-    wrapper = textwrap.TextWrapper(WIDTH, f"{label:<14}", " " * 14, max_lines=most, placeholder=" ... (details.txt)")
+    wrapper = textwrap.TextWrapper(WIDTH, f"{label:<13} ", " " * 14, max_lines=most, placeholder=" ... (details.txt)")
     return wrapper.wrap(text.replace("\n", ". "))
 
 

@@ -50,8 +50,9 @@ def report(folder, views, status="registered"):
     """The page of a run of these objects; `views` by object, None for one without."""
     (folder / "summary").mkdir()
     (folder / "summary/summary.txt").write_text("all well\n")
-    rows = "".join(f"{name}\t{status}\tbecause\n" for name in views)
-    (folder / "summary/objects.tsv").write_text(f"object\tstatus\treason\n{rows}")
+    rows = "".join(f"{name}\t{status}\tbecause\t0.03\t0.04\n" for name in views)
+    columns = "object\tstatus\treason\tscale_sd_log\tscene_scale_sd_log"
+    (folder / "summary/objects.tsv").write_text(f"{columns}\n{rows}")
     for name, view in views.items():
         (folder / name / "figures").mkdir(parents=True)
         if view is not None:
@@ -241,9 +242,9 @@ def test_two_clicked_points_are_measured_in_the_scenes_unit(opened):
     picture, stage = opened.picture(STAGE), opened.find(STAGE)
     for color in (RED, BLUE):
         click(opened, stage, *middle_of(picture, color))
-    # With one standard deviation, of both points.
-    assert re.fullmatch(r"1\.2 ± 0\.0\d+ m", opened.find(f"{SECTION} output").text)
-    assert "1.2 ± " in opened.find(f"{SECTION} .marks").get_attribute("textContent")
+    # With one standard deviation, of both points, 0.050 m, and of a scale known to 5 %.
+    assert opened.find(f"{SECTION} output").text == "1.200 ± 0.078 m"
+    assert "1.200 ± " in opened.find(f"{SECTION} .marks").get_attribute("textContent")
     assert (np.abs(opened.picture(STAGE).astype(int) - ACCENT).max(2) < 20).sum() > 50
     # The marks stay on the points while the view turns.
     stage.send_keys(ARROW_RIGHT * 3)
@@ -322,7 +323,7 @@ def test_a_phone_shows_turns_and_measures_without_scrolling_sideways(page):
         first = phone.picture(STAGE)
         for color in (RED, BLUE):
             touch(phone, stage, [middle_of(first, color)])
-        assert phone.find(f"{SECTION} output").text.startswith("1.2 ± ")
+        assert phone.find(f"{SECTION} output").text.startswith("1.200 ± ")
         choose(phone, "Measure")
         camera, top = camera_of(phone), phone.value("return scrollY;")
         touch(phone, stage, [(100, 100), (160, 140), (220, 160)])

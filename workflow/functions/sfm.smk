@@ -88,11 +88,11 @@ def check_survey(scene):
     own = {column: Path(f) for column, f in files.items() if not made_here(f)}
     if own and not made_here(row["photos"]):
         # Takes long to import, and most scenes have no survey.
-        from scenefuse.photos.photos import photo_names
+        from scenefuse.photos.photos import distinct_photos
         from scenefuse.georef.control import check_survey_files
 
         try:
-            check_survey_files(photo_names(Path(row["photos"])), **own)
+            check_survey_files(distinct_photos(Path(row["photos"]))[0], **own)
         except StageError as error:
             refuse(f"{config['scenes']}, scene '{scene}': {error}")
 
@@ -209,11 +209,13 @@ def check_lengths(name):
     photos = object_row(name)["photos"]
     for file in own_file("object", name, "lengths"):
         if Path(photos).is_dir() and not made_here(file):
-            from scenefuse.photos.photos import photo_names
+            from scenefuse.photos.photos import distinct_photos
             from scenefuse.georef.control import check_survey_files
 
             try:
-                names = [frame_name(photo) for photo in photo_names(Path(photos))]
+                names = [
+                    frame_name(photo) for photo in distinct_photos(Path(photos))[0]
+                ]
                 check_survey_files(names, lengths=Path(file))
             except StageError as error:
                 refuse(f"{config['objects']}, object '{name}': {error}")

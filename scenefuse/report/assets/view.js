@@ -335,10 +335,12 @@ class View {
   }
 
   distance() {
+    // One standard deviation: of both ends, and of the scale.
     const length = norm(minus(...this.picked));
-    const spread = Math.hypot(...this.picked.map((point) => point.deviation));
-    const around = spread > 0 ? ` ± ${Number(spread.toPrecision(2))}` : "";
-    return `${Number(length.toPrecision(4))}${around} ${this.about.unit}`;
+    const spread = Math.hypot(...this.picked.map((point) => point.deviation), this.about.scale_sd * length);
+    if (!(spread > 0)) return `${Number(length.toPrecision(4))} ${this.about.unit}`;
+    const decimals = Math.max(0, 1 - Math.floor(Math.log10(spread)));
+    return `${length.toFixed(decimals)} ± ${spread.toFixed(decimals)} ${this.about.unit}`;
   }
 
   drawMarks() {
