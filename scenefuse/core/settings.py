@@ -19,6 +19,8 @@ SHIPPED = PACKAGE / "shipped"
 ROOT = SHIPPED if SHIPPED.is_dir() else PACKAGE.parent
 # A project's own settings.
 OWN_SETTINGS = Path("config/config.yaml")
+# More values than any settings file has; messages about fewer are still short.
+MAX_VALUES = 10_000
 T = TypeVar("T")
 # A JSON schema's validator to which NaN, infinity and what exceeds a float are no numbers.
 _TYPES = jsonschema.Draft202012Validator.TYPE_CHECKER.redefine(
@@ -63,6 +65,8 @@ def problem(content: Any, schema: Mapping[str, Any]) -> str | None:
 
 def problem_at(content: Any, schema: Mapping[str, Any]) -> tuple[list[Any], str | None]:
     """The keys that lead to what `problem` says, and its sentence; None where nothing is wrong."""
+    if _grows(content):
+        return [], "aliases of YAML expand without end; write what they stand for"
     for error in _Validator(schema).iter_errors(content):
         keys, message = list(error.absolute_path), error.message
         where = ".".join(map(str, keys))
@@ -132,6 +136,16 @@ def read_differences(mine: Path) -> dict[str, Any]:
     if wrong:
         raise StageError(f"{place_of(keys, mine) or mine}, {wrong}")
     return own
+
+
+def _grows(content: Any) -> bool:
+    """Whether content of YAML, whose aliases may repeat each other, has more than `MAX_VALUES` values."""
+    left, count = [content], 0
+    while left and count <= MAX_VALUES:
+        part = left.pop()
+        count += 1
+        left += part.values() if isinstance(part, dict) else part if isinstance(part, list) else ()
+    return bool(left)
 
 
 def build(settings: type[T], values: Mapping[str, Any]) -> T:

@@ -212,6 +212,14 @@ def test_tables_and_settings(folder, name, data):
     within_limits(reader, written(folder / name, data.draw(mutated(text))))
 
 
+def test_settings_whose_aliases_expand_without_end_are_refused(tmp_path):
+    lists = ["&a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    lists += [f"&a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 12)]
+    for text in (f"seed: [{', '.join(lists)}]", "seed: &a [*a]"):
+        with pytest.raises(StageError, match="bomb.yaml, aliases of YAML expand without end"):
+            read_settings(written(tmp_path / "bomb.yaml", text))
+
+
 NAMES = st.lists(st.text(alphabet="aAbB/\\._ 1äÄ\u0308jpgJPG", max_size=12), max_size=6)
 
 

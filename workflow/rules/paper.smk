@@ -5,7 +5,7 @@
 # OUTPUTS   results/objects/{object}/stage1/ to stage4/, their JSON, object.ply, registration/{variant}/
 #           results/objects/{object}/poses/, poses.json                     poses after stage 1: the pose network's chain, or SfM's
 #           results/objects/{object}/refined_poses/, refined_poses.json     the same after stage 3
-#           results/summary/paper.tsv, paper.html    the paper's Tables 2 to 4, beside the run that config names: evaluation.paper
+#           results/summary/paper.tsv, paper.html    the paper's Tables 2 to 4: its own numbers, this run's, and chance
 
 
 ruleorder: estimate_as_paper > estimate_depth_prior
