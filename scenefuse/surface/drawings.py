@@ -20,7 +20,7 @@ from scenefuse.core.stage import StageError, atomic_directory, quantity, read_js
 from scenefuse.core.transforms import UP, Array
 from scenefuse.fuse.compare import MARGIN
 from scenefuse.fuse.measure import SUPPORT
-from scenefuse.photos.geodesy import length_unit, scene_frame
+from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
 from scenefuse.surface.gltf import BRIDGED_TINT, Painted, metres_per_unit, read_painted
 from scenefuse.surface.make_surface import read_surface
 from scenefuse.surface.mesh import FaceClass, Surface, cast, caster
@@ -176,36 +176,41 @@ def draw_surface(
         painted = replace(painted, points=painted.points / metres)
     turn = wall_turn(whole) if len(whole.faces) else 0.0
     frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
+    # Of the CRS in one of the scene, which counts in metres where its CRS may in feet.
+    per_unit = 1.0 if frame is None else float(np.ptp(frame.in_crs(UP * np.arange(2)[:, None])[:, 2]))
     with atomic_directory(folder) as output:
         pages = PdfPages(output / "drawings.pdf", metadata={"CreationDate": None})
         for side, axes in _axes_of(whole, turn, facade).items() if len(whole.faces) else ():
-            drawn, shown, crs, shift = whole, painted, None, np.zeros(3)
+            drawn, shown, crs, shift, counted, ratio = whole, painted, None, np.zeros(3), unit, 1.0
             if side != "above":
                 if side == "facade":
                     shift[2] = -axes[2] @ np.array(facade[:3])
                 # Of an inclined plane, up are no heights.
                 if frame is not None and axes[1] @ UP > 1 - MARGIN:
                     middle = whole.vertices.points.mean(0, keepdims=True)
-                    shift[1] = (frame.in_crs(middle) - middle)[0, 2]
+                    shift[1] = frame.in_crs(middle)[0, 2] / per_unit - middle[0, 2]
             elif frame is not None:
-                crs, shift = frame.crs, np.floor(frame.in_crs(np.zeros((1, 3)))[0])
+                crs, shift, ratio = frame.crs, np.floor(frame.in_crs(np.zeros((1, 3)))[0]), per_unit
+                counted = frame.crs_unit if isinstance(frame, LocalFrame) else unit
                 vertices = whole.vertices
-                drawn = replace(whole, vertices=replace(vertices, points=frame.in_crs(vertices.points) - shift))
+                fields = vertices.fields | {"deviation": ratio * vertices.fields["deviation"]}
+                points = frame.in_crs(vertices.points) - shift
+                drawn = replace(whole, vertices=replace(vertices, points=points, fields=fields))
                 shown = None if painted is None else replace(painted, points=frame.in_crs(painted.points) - shift)
-            drawing = draw(drawn, shown, axes, pixel_of(whole, painted))
+            drawing = draw(drawn, shown, axes, ratio * pixel_of(whole, painted))
             _write_bands(output / side, drawing, crs, shift)
             azimuth = (
                 "" if side == "above" else f", looking {np.degrees(np.arctan2(-axes[2, 0], -axes[2, 1])) % 360:.1f}°"
             )
-            scale = _scale(drawing, metres)
+            scale = _scale(drawing, metres / ratio)
             where = {"above": "from above", "facade": "facade"}.get(side, f"from the {side}")
             title = f"{name} {where}{azimuth}"
             title += f"; 1:{scale}" if unit != "scene units" else ""
             left = drawing.left + shift[0] if side == "above" else 0.0
-            figure = _sheet(drawing, title, unit, metres / scale, (left, drawing.top + shift[1]))
+            figure = _sheet(drawing, title, counted, metres / ratio / scale, (left, drawing.top + shift[1]))
             figure.savefig(output / f"{side}.png", dpi=200)
             pages.savefig(figure)
-            report[f"{side}_pixel"], report[f"{side}_scale"] = quantity(drawing.pixel, unit), quantity(scale, "1")
+            report[f"{side}_pixel"], report[f"{side}_scale"] = quantity(drawing.pixel, counted), quantity(scale, "1")
         if not len(whole.faces):
             pages.savefig(Figure(figsize=(1, 1)))
         pages.close()

@@ -381,6 +381,22 @@ def test_a_drawing_from_above_lies_in_the_crs_of_its_scene(placed):
     assert np.isnan(heights[0, 0])
 
 
+def test_a_scene_in_metres_is_drawn_from_above_in_the_feet_of_its_crs(coarse, tmp_path):
+    place = {"latitude_deg": 37.5, "longitude_deg": -122.0, "altitude_m": 30.48006}
+    known = {f"origin_{name}": quantity(number, "") for name, number in place.items()}
+    feet = known | {"crs": quantity("EPSG:2227", ""), "length_unit": quantity("m", "")}
+    write_json(tmp_path / "g.json", feet)
+    folder = ball_drawn(coarse, tmp_path, georeference_json=tmp_path / "g.json")
+    report, above = read_json(folder / "drawings.json"), rasterio.open(folder / "above_height.tif")
+    pixel = report["above_pixel"]
+    assert pixel["unit"] == "US survey foot" and above.res[0] == pytest.approx(pixel["value"])
+    assert pixel["value"] == pytest.approx(value(report, "south_pixel") / 0.3048006)
+    assert value(report, "above_scale") == value(report, "south_scale")
+    south = rasterio.open(folder / "south_class.tif")
+    assert np.nanmax(above.read(1)) == pytest.approx(100 + 1 / 0.3048006, abs=0.02)
+    assert south.bounds.top == pytest.approx(31.48, abs=0.05)
+
+
 def test_elevations_are_turned_to_the_walls():
     points, normals = [], []
     for axis in range(4):
