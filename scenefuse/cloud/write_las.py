@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,7 +79,10 @@ class LasLayout:
         header.scales, header.offsets = np.full(3, step), offset
         header.global_encoding.wkt = True  # LAS 1.4 asks it of these columns, with or without a CRS
         if crs is not None:
-            header.add_crs(pyproj.CRS.from_user_input(crs))
+            named = pyproj.CRS.from_user_input(crs)
+            header.add_crs(named)
+            with suppress(pyproj.exceptions.CRSError):  # LAS asks for WKT 1, which does not know every CRS
+                header.vlrs.get("WktCoordinateSystemVlr")[0].string = named.to_wkt("WKT1_GDAL")
         # Classes and intensities of LAS stay what they are; of other fields none takes their names.
         own = [name for name, kind in LAS_DIMENSIONS.items() if name in like.fields and like.fields[name].dtype == kind]
         further = [name for name in like.fields if name not in own]

@@ -64,6 +64,8 @@ def test_every_point_is_there_once_with_all_it_had(tmp_path, small_nodes):
     colors = np.stack([las.red, las.green, las.blue], axis=1)[order]
     assert np.array_equal(colors // 257, cloud.colors)
     assert las.header.parse_crs().to_epsg() == 32632
+    # LAS 1.4 asks for WKT 1; few programs but PROJ's read WKT 2.
+    assert las.header.vlrs.get("WktCoordinateSystemVlr")[0].string.startswith("PROJCS[")
     assert np.allclose([las.header.mins, las.header.maxs], [las.xyz.min(0), las.xyz.max(0)], atol=1e-6)
     assert las.header.number_of_points_by_return[0] == len(cloud)
 
