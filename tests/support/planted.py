@@ -101,6 +101,35 @@ SHAPES = {
 }
 
 
+def _gabled(half_width, half_depth, eaves, ridge):
+    """A house with a saddle roof along x."""
+    w, d = half_width, half_depth
+    foot, wall = [[[x, y, z] for x, y in ((-w, -d), (w, -d), (w, d), (-w, d))] for z in (0, eaves)]
+    vertices = np.array([*foot, *wall, [-w, 0, ridge], [w, 0, ridge]], dtype=float)
+    sides = [(0, 1, 5), (0, 5, 4), (2, 3, 7), (2, 7, 6), (0, 4, 7), (0, 7, 3), (1, 2, 6), (1, 6, 5)]
+    roof = [(4, 5, 9), (4, 9, 8), (6, 7, 8), (6, 8, 9), (4, 8, 7), (5, 6, 9)]
+    return Part(vertices, np.array(sides + roof), 0)
+
+
+_PORCH, _ANNEX = box((-1, -3.8, 0), (1.2, -2.6, 2.2), 0), box((4, -1.5, 0), (6, 0.8, 2.2), 0)
+_CHIMNEY, _FLAT = box((1.8, 0.6, 2), (2.4, 1.2, 5.2), 0), box((-4, -2.6, 0), (4, 2.6, 3.6), 0)
+# Buildings of one footprint, 8 x 5.2, that hold each other's poses.
+BUILDINGS = {
+    "gable": Shape(lambda: [_gabled(4, 2.6, 2.6, 4.6)]),
+    "gable, porch, chimney": Shape(lambda: [_gabled(4, 2.6, 2.6, 4.6), _CHIMNEY, _PORCH]),
+    "gable, porch, chimney, higher": Shape(lambda: [_gabled(4, 2.6, 4.0, 5.2), _CHIMNEY, _PORCH]),
+    "gable, annex, chimney": Shape(lambda: [_gabled(4, 2.6, 2.6, 4.6), _CHIMNEY, _ANNEX]),
+    "gable, annex, other chimney": Shape(
+        lambda: [_gabled(4, 2.6, 2.6, 4.6), box((-2.4, 0.6, 2), (-1.8, 1.2, 5.2), 0), _ANNEX]
+    ),
+    "flat": Shape(lambda: [_FLAT]),
+    "flat, lower": Shape(lambda: [box((-4, -2.6, 0), (4, 2.6, 2.6), 0)]),
+    "flat, higher": Shape(lambda: [box((-4, -2.6, 0), (4, 2.6, 4.6), 0)]),
+    "flat, porch": Shape(lambda: [_FLAT, _PORCH]),
+    "flat, annex": Shape(lambda: [_FLAT, _ANNEX]),
+}
+
+
 def _noise(points, seed, cells):
     """Smooth noise 0..1 in space: a few seeded plane waves."""
     rng = np.random.default_rng(seed)
@@ -151,7 +180,7 @@ def _seen_by(rays, points, camera):
 @cache
 def _outer(name):
     """The part of a shape (z up) that photos from around it see: mesh, points, normals, colours, centre, diagonal."""
-    part = join([p for p in SHAPES[name].parts()])
+    part = join((SHAPES | BUILDINGS)[name].parts())
     mesh = _mesh(part).to_legacy()
     rays = o3d.t.geometry.RaycastingScene()
     rays.add_triangles(_mesh(part))
@@ -258,7 +287,7 @@ def plant(
     if depth_maps:
         views = _depth_maps(rays, own, cameras, points[shown], centre, diagonal, noise, rng)
         free_space = FreeSpace([without_edges(v) for v in views], 0.03 * diagonal)
-    shape = SHAPES[name]
+    shape = (SHAPES | BUILDINGS)[name]
     return Trial(
         Cloud(object_cloud, normals[chosen].astype(np.float32), _bytes(colors[chosen] * gain)).transformed(
             object_from_scene

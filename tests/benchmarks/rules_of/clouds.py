@@ -2,7 +2,8 @@
 
 Trials are of four kinds in turn: with all evidence, by shape alone (no gravity, colours or depth maps), with all
 evidence where the scene shows more, and another object's scene, in which every pose is wrong. After these come mirrored
-objects, of which every pose is wrong, too.
+objects, of which every pose is wrong, too; at the end, without colours, buildings whose scene has another one of the
+same footprint.
 """
 
 from dataclasses import replace
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from registration import ROTATION_DEG, SCALE_PCT, SHIFT, mirrored, planted
 from rules import Rule, without
-from support.planted import SHAPES, errors
+from support.planted import SHAPES, errors, plant
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
@@ -28,7 +29,15 @@ UP = np.array([0.0, 0.0, 1.0])
 NAMES = list(SHAPES)
 KINDS = ("all evidence, 30 % shown", "shape alone, 70 % shown", "all evidence, 50 % shown", "absent")
 MIRRORED = "mirrored"
-TRIALS = (len(KINDS) + 1) * len(NAMES)
+DECOY = "another building of the same footprint, no colours"
+DECOYS = (
+    ("gable", "flat"), ("gable", "flat, lower"), ("gable", "flat, higher"),
+    ("gable, porch, chimney", "flat"), ("gable, porch, chimney", "flat, porch"),
+    ("gable, porch, chimney", "gable, porch, chimney, higher"),
+    ("gable, porch, chimney", "gable, annex, other chimney"), ("gable, annex, chimney", "flat, annex"),
+)  # fmt: skip
+FIRST_DECOY = (len(KINDS) + 1) * len(NAMES)
+TRIALS = FIRST_DECOY + 6 * len(DECOYS)
 # Less work than by default, so that many rules can be tried.
 COARSE = CoarseSettings(ransac_samples=10000, scale_steps=9, yaw_steps=16, candidates=12, keep=4)
 LITTLE: dict[str, Any] = {"voxel_fraction": 0.012, "turn_steps": 12}
@@ -43,6 +52,11 @@ AFTER_CANDIDATES = (
 @cache
 def trial_of(number: int) -> tuple[Any, Cloud, str]:
     """A planted trial, its crop, and its kind."""
+    if number >= FIRST_DECOY:
+        names, seed = DECOYS[(number - FIRST_DECOY) % len(DECOYS)], 1 + (number - FIRST_DECOY) // len(DECOYS)
+        plain = {"ground": False, "depth_maps": False, "object_points": 9000, "density_ratio": 1.0}
+        trial, other = (plant(name, seed + 50 * k, **plain) for k, name in enumerate(names))
+        return replace(trial, object=replace(trial.object, colors=None)), replace(other.scene, colors=None), DECOY
     kind, repeat = KINDS[number % len(KINDS)], number // len(KINDS)
     if repeat >= len(NAMES):
         kind, repeat = MIRRORED, number % len(NAMES)
@@ -58,6 +72,8 @@ def trial_of(number: int) -> tuple[Any, Cloud, str]:
 
 def _name(number: int) -> str:
     """The shape of a trial."""
+    if number >= FIRST_DECOY:
+        return DECOYS[(number - FIRST_DECOY) % len(DECOYS)][0]
     return NAMES[number // len(KINDS)] if number < len(KINDS) * len(NAMES) else NAMES[number % len(NAMES)]
 
 
@@ -115,9 +131,9 @@ def _outcome(number: int, found: list[Hypothesis]) -> tuple[dict[str, Any], tupl
 def _rated(number: int, pose: Sim3, stated: Uncertainty | None, found: decision.Decision) -> dict[str, Any]:
     """A pose and its decision beside the truth."""
     trial, _, kind = trial_of(number)
-    axis = UP if SHAPES[_name(number)].round else trial.axis
+    axis = UP if _name(number) in SHAPES and SHAPES[_name(number)].round else trial.axis
     scale, angle, shift = errors(pose, trial.scene_from_object, trial.object.points.mean(0), trial.diagonal, axis)
-    if kind in (KINDS[3], MIRRORED) or abs(scale) > SCALE_PCT or angle > ROTATION_DEG or shift > SHIFT:
+    if kind in (KINDS[3], MIRRORED, DECOY) or abs(scale) > SCALE_PCT or angle > ROTATION_DEG or shift > SHIFT:
         return _measured(number, False, found.registered, found.reason)
     over = np.nan if stated is None else abs(np.log(1 + scale / 100)) / max(stated.scale_sd_log, 1e-9)
     return _measured(number, True, found.registered, found.reason, abs(scale), angle, 100 * shift, over)
@@ -231,6 +247,7 @@ RULES = [
     Rule("score: area at the usual scale", f"{R}.refinement.score", _own_area),
     Rule("score: colours", f"{R}.score.color_agreement", lambda _: lambda *args: None),
     Rule("score: free space", f"{R}.refinement.score", _blind),
+    Rule("score: displaced surfaces", f"{R}.refinement.displaced_share", lambda _: lambda *args: None),
     # The gate.
     Rule("gate: F-score", f"{HERE}.FineSettings", _setting(min_f_score=0.0)),
     Rule("gate: recall", f"{R}.decision.MIN_RECALL", constant(0.0)),
