@@ -1,1 +1,1 @@
-"""The rendered capture with known truth: meshes, textures, cameras, photos, simulated clicks."""
+"""The rendered capture with known truth: meshes, textures, cameras, photos, simulated clicks; and its evaluation."""

@@ -1,7 +1,7 @@
 """The demo's camera bodies, and what each makes of the light that reaches it: blur, vignetting, exposure, noise, tone.
 
 Lens distortion and principal point are geometry: the renderer casts its rays through them
-(`scenefuse.metrics.truth`).
+(`demo.truth`).
 All that is done here happens in linear light, before the tone curve and the rounding to 8 bits.
 """
 
@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demo import textures
+from demo.truth import Cameras
 from scenefuse.core.stage import quantity
 from scenefuse.core.transforms import Array
-from scenefuse.metrics.truth import Cameras
 
 Kind = Literal["real", "ideal"]
 

@@ -13,10 +13,10 @@ from PIL import Image
 
 from demo import bodies, textures
 from demo.bodies import Body, Exposure, draw_exposure, expose
+from demo.truth import Cameras, cameras_json, pinhole
 from demo.world import MAPPED, ORIGIN, SUN, World, build_world, openness
 from scenefuse.core.stage import StageError, atomic_directory, quantity, setting, threads, write_json
 from scenefuse.core.transforms import look_at
-from scenefuse.metrics.truth import Cameras, cameras_json, pinhole
 
 
 @dataclass(frozen=True)

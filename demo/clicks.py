@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from demo.truth import read_cameras, visible
 from demo.world import build_world
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.metrics.truth import read_cameras, visible
 from scenefuse.photos.pictures import read_mask
 
 # A point counts as hidden when something lies this far before it.

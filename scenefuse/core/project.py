@@ -25,9 +25,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.tables import Row, read_table
 
 # Columns about a row's photos.
-PHOTO_COLUMNS = ("calibration", "cameras", "control", "lengths", "prompts", "masks", "truth")
-# Columns of an object about its scene.
-SCENE_COLUMNS = ("fiducials", "truth")
+PHOTO_COLUMNS = ("calibration", "cameras", "control", "lengths", "prompts", "masks")
 # Sections that the settings file of a row may hold, and settings in them that are the same for the whole run.
 OWN_SECTIONS = {"scene": ("scene",), "object": ("object", "registration", "fusion")}
 RUN_SETTINGS = ("scene.chunks", "object.recipe", "registration.variants")
@@ -152,12 +150,10 @@ def _scene_problem(row: Row, scenes: Mapping[str, Row], table: str) -> str:
         if row.get("cloud"):
             other = "empty the cell cloud" if row.get("photos") else "give photos"
             return f"is a cloud and lies in no scene, so there is nothing to do; name its scene, or {other}"
-        column = next((column for column in SCENE_COLUMNS if row.get(column)), None)
-        return f"lies in no scene that its {column} could be of; empty that cell, or name its scene" if column else ""
+        unused = "lies in no scene that its fiducials could be of; empty that cell, or name its scene"
+        return unused if row.get("fiducials") else ""
     if scene not in scenes:
         return f"lies in scene '{scene}', which {table} does not list"
-    if row.get("truth") and not scenes[scene].get("photos"):
-        return f"has a truth, but its scene '{scene}' is a cloud, and the evaluation compares cameras; empty the cell"
     return ""
 
 

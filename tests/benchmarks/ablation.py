@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 import yaml
 
+from demo.truth import fit_cameras, read_cameras, read_posed, registration_error
 from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.core.settings import ROOT, build
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
-from scenefuse.metrics.truth import fit_cameras, read_cameras, read_posed, registration_error
 from scenefuse.paper.register_as_paper import register_as_paper
 from scenefuse.register.coarse import CoarseSettings, register_coarsely
 from scenefuse.register.decision import FineSettings

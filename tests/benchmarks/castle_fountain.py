@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from demo.truth import CameraFit, Cameras, fit_cameras, read_posed, registration_error
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
-from scenefuse.metrics.truth import CameraFit, Cameras, fit_cameras, read_posed, registration_error
 
 
 def cameras(truth: dict, capture: str) -> Cameras:

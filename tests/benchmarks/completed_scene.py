@@ -21,6 +21,14 @@ import open3d as o3d
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from demo.evaluate import (
+    ObjectTruth,
+    around_object,
+    read_object_truth,
+    scene_scores,
+    surface_to_find,
+)
+from demo.truth import THRESHOLDS, read_cameras, registration_error
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.core.stage import StageError, read_json, run, threads, value
 from scenefuse.core.transforms import Array, Sim3
@@ -30,14 +38,6 @@ from scenefuse.fuse.modes import FusionSettings, around, fuse_by_distance, fuse_
 from scenefuse.fuse.write import Source, together
 from scenefuse.geometry.icp import step_to_planes
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, moved_photos, read_photos
-from scenefuse.metrics.evaluate import (
-    ObjectTruth,
-    around_object,
-    read_object_truth,
-    scene_scores,
-    surface_to_find,
-)
-from scenefuse.metrics.truth import THRESHOLDS, read_cameras, registration_error
 from scenefuse.photos.workspace import read_workspace
 from scenefuse.register.uncertainty import Uncertainty
 

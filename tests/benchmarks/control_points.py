@@ -25,6 +25,8 @@ import pyproj
 import tyro
 from numpy.typing import NDArray
 
+from demo.evaluate import within
+from demo.truth import HIDDEN, Cameras, cast_together, read_cameras, read_mesh, sample_surface, visible
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array
 from scenefuse.georef.control import (
@@ -40,8 +42,6 @@ from scenefuse.georef.georeference import adjust_georeferenced, camera_poses, ge
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.georef.residuals import rms
 from scenefuse.marks.clicks import Click
-from scenefuse.metrics.evaluate import within
-from scenefuse.metrics.truth import HIDDEN, Cameras, cast_together, read_cameras, read_mesh, sample_surface, visible
 from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo, list_photos, read_photos
 from scenefuse.photos.workspace import read_model

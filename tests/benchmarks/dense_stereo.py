@@ -20,11 +20,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from scenefuse.cloud.clouds import Cloud, read_cloud
-from scenefuse.core.stage import read_json, run, value
-from scenefuse.core.transforms import Array, Sim3
-from scenefuse.metrics.evaluate import within
-from scenefuse.metrics.truth import (
+from demo.evaluate import within
+from demo.truth import (
     HIDDEN,
     cast_together,
     distances,
@@ -38,6 +35,9 @@ from scenefuse.metrics.truth import (
     true_depth,
     visible,
 )
+from scenefuse.cloud.clouds import Cloud, read_cloud
+from scenefuse.core.stage import read_json, run, value
+from scenefuse.core.transforms import Array, Sim3
 from scenefuse.photos.pictures import read_depth
 from scenefuse.photos.workspace import View, Workspace, read_workspace
 

@@ -19,9 +19,9 @@ import pandas as pd
 import pycolmap
 
 from demo.capture import OrbitSettings, render_object
+from demo.truth import Cameras, read_cameras, read_mesh, sample_surface, visible
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import quantity, run, write_json
-from scenefuse.metrics.truth import Cameras, read_cameras, read_mesh, sample_surface, visible
 from scenefuse.nerf.depth_prior import estimate_depth_prior
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.rendered_maps import refine_depth

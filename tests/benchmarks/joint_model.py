@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from demo.truth import registration_error
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import StageError, read_json, run, value
 from scenefuse.core.transforms import Array, Sim3, fit_sim3_robust
-from scenefuse.metrics.truth import registration_error
 from scenefuse.photos.workspace import posed_images, read_model
 
 LEAST_PHOTOS = 4

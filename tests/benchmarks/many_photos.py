@@ -29,6 +29,7 @@ from demo import bodies, textures, world
 from demo.capture import _exif, focal_px, height_px, render
 from demo.objects import OBJECTS, grid, rotation
 from demo.textures import Material, noise_at
+from demo.truth import Cameras, cameras_json, fit_cameras, pinhole, read_cameras, read_posed
 from scenefuse.core.stage import (
     StageError,
     atomic_directory,
@@ -42,7 +43,6 @@ from scenefuse.core.stage import (
     write_json,
 )
 from scenefuse.core.transforms import Array, look_at
-from scenefuse.metrics.truth import Cameras, cameras_json, fit_cameras, pinhole, read_cameras, read_posed
 from scenefuse.photos.photos import Photo, write_photos
 from scenefuse.sfm import mapping
 from scenefuse.sfm.matches import MatchSettings, spatial_pairs

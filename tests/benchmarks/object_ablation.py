@@ -17,10 +17,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from scenefuse.cloud.clouds import read_cloud
-from scenefuse.core.settings import build, read_settings
-from scenefuse.core.stage import StageError, read_json, run, value
-from scenefuse.metrics.evaluate import (
+from demo.evaluate import (
     COMPARED_PHOTOS,
     ObjectTruth,
     around_object,
@@ -28,7 +25,10 @@ from scenefuse.metrics.evaluate import (
     depth_results,
     read_object_truth,
 )
-from scenefuse.metrics.truth import SAMPLES
+from demo.truth import SAMPLES
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import StageError, read_json, run, value
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.rendered_maps import psnr, refine_depth
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 import pandas as pd
 
+from demo.evaluate import ObjectTruth, cloud_results, depth_results, read_object_truth
+from demo.truth import SAMPLES
 from scenefuse.cloud.clouds import Cloud, read_cloud, voxel_downsample, write_cloud
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, read_json, run, value
 from scenefuse.geometry.consistency import compare
-from scenefuse.metrics.evaluate import ObjectTruth, cloud_results, depth_results, read_object_truth
-from scenefuse.metrics.truth import SAMPLES
 from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
 from scenefuse.mvs.depth_maps import estimate_depth_maps
 from scenefuse.mvs.plane_sweep import DepthMapSettings

@@ -18,13 +18,13 @@ import pandas as pd
 import yaml
 from support.marks import frame_of_its_own, marks_of
 
+from demo.evaluate import ObjectTruth, read_object_truth, scene_scores, surface_to_find
+from demo.truth import read_cameras
 from scenefuse.cloud.clouds import read_cloud, write_cloud
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.settings import ROOT
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
-from scenefuse.metrics.evaluate import ObjectTruth, read_object_truth, scene_scores, surface_to_find
-from scenefuse.metrics.truth import read_cameras
 
 SCENE, SAMPLES = "demo", 60000
 

@@ -21,13 +21,13 @@ import cv2
 import numpy as np
 import pandas as pd
 
+from demo.evaluate import ObjectTruth, cloud_results, depth_results, read_object_truth
+from demo.truth import SAMPLES, registration_error, true_depth
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.job_records import JobRecords, why_unfinished
 from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
-from scenefuse.metrics.evaluate import ObjectTruth, cloud_results, depth_results, read_object_truth
-from scenefuse.metrics.truth import SAMPLES, registration_error, true_depth
 from scenefuse.paper.compare_with_paper import (
     NULL,
     OBJECTS,

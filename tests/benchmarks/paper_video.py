@@ -21,10 +21,10 @@ from scipy.spatial.transform import Rotation
 
 from demo import bodies, textures
 from demo.capture import render
+from demo.truth import Cameras, pinhole
 from demo.world import World, build_world, openness
 from scenefuse.core.stage import run, threads, value
 from scenefuse.core.transforms import Array, fit_sim3, look_at
-from scenefuse.metrics.truth import Cameras, pinhole
 from scenefuse.paper.estimate_as_paper import chained, trajectory_error
 from scenefuse.paper.monocular import (
     frames_of,

@@ -20,6 +20,7 @@ import pyproj
 import yaml
 from plyfile import PlyData
 
+from demo.truth import read_cameras
 from demo.world import ORIGIN
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.cloud.write_las import write_laz
@@ -28,7 +29,6 @@ from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array
 from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.placement import GeoreferenceSettings
-from scenefuse.metrics.truth import read_cameras
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.photos import read_photos, write_photos
 
@@ -114,10 +114,9 @@ def completed(results: Path, work: Path, name: str, cores: int) -> None:
     """Run the workflow over the scan, the flight's photos and an object's, and print its summary."""
     of = results / "demo" / SCENE
     tables = {
-        "scenes": {"scene": SCENE, "photos": of / "scene/photos", "cloud": "scan.laz", "truth": of / "truth/scene"},
+        "scenes": {"scene": SCENE, "photos": of / "scene/photos", "cloud": "scan.laz"},
         "objects": {
             "object": name, "scene": SCENE, "photos": of / name / "photos", "prompts": of / name / "prompts.tsv",
-            "truth": of / "truth" / name,
         },
     }  # fmt: skip
     for kind, cells in tables.items():

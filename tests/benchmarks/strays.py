@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pandas as pd
 
+from demo.evaluate import read_object_truth
+from demo.truth import distances
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.fuse.measure import Evidence
 from scenefuse.fuse.write import Source
-from scenefuse.metrics.evaluate import read_object_truth
-from scenefuse.metrics.truth import distances
 
 # Shares of the diagonal beyond which a point is counted.
 FAR = (0.005, 0.01)

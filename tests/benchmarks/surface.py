@@ -13,11 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from demo.evaluate import read_object_truth, scene_scores, surface_to_find
+from demo.truth import SAMPLES, Mesh, distances, read_cameras, sample_surface
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.metrics.evaluate import read_object_truth, scene_scores, surface_to_find
-from scenefuse.metrics.truth import SAMPLES, Mesh, distances, read_cameras, sample_surface
 from scenefuse.photos.pictures import read_gray, read_rgb
 from scenefuse.photos.workspace import read_cameras as cameras_of
 from scenefuse.sfm.undistort import undistort_picture

@@ -14,12 +14,12 @@ import numpy as np
 import pandas as pd
 from support.marks import frame_of_its_own, marks_of
 
+from demo.evaluate import read_object_truth, scene_scores, surface_to_find
+from demo.truth import read_cameras, registration_error
 from scenefuse.cloud.clouds import read_cloud, write_cloud
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
-from scenefuse.metrics.evaluate import read_object_truth, scene_scores, surface_to_find
-from scenefuse.metrics.truth import read_cameras, registration_error
 from scenefuse.register.register import Known
 from scenefuse.two_clouds.register import ExitStatus, register
 

@@ -31,7 +31,7 @@ def test_unknown_object_in_a_target(refused):
 
 def test_an_object_in_no_scene_ends_with_its_cloud(project, snakemake, refused):
     project.photos("close")
-    project.scenes, project.objects = "scene\tphotos\n", HEADER + "shed\t\tclose\t\tprompts.tsv\t\t\n"
+    project.scenes, project.objects = "scene\tphotos\n", HEADER + "shed\t\tclose\t\tprompts.tsv\t\n"
     (project.path / "prompts.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t1.jpg\t20\t20\n")
     result = snakemake(project.path, "-n", config=project.write())
     rules = planned(result.stdout)
@@ -43,7 +43,7 @@ def test_an_object_in_no_scene_ends_with_its_cloud(project, snakemake, refused):
 
 def test_weights_are_fetched_only_where_the_masks_may_need_them(project, snakemake):
     project.photos("close")
-    project.scenes, project.objects = "scene\tphotos\n", HEADER + "shed\t\tclose\t\tprompts.tsv\t\t\n"
+    project.scenes, project.objects = "scene\tphotos\n", HEADER + "shed\t\tclose\t\tprompts.tsv\t\n"
     (project.path / "prompts.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t1.jpg\t20\t20\n")
 
     def fetches(**masks):
@@ -90,7 +90,7 @@ def test_too_few_registered_photos(project, refused):
 
 def test_object_without_prompts_and_masks(project, refused):
     project.photos("close")
-    project.objects = HEADER + "shed\tyard\tclose\tclicks.tsv\t\t\t\n"
+    project.objects = HEADER + "shed\tyard\tclose\tclicks.tsv\t\t\n"
     assert "'shed' has neither prompts nor masks" in refused("-n", "results/objects/shed/masks.json")
 
 
@@ -147,7 +147,7 @@ def test_clicks_that_cannot_be_used_stop_before_anything_runs(project, refused, 
     project.photos("flight")
     project.photos("close", 4)
     project.config["object"]["frames"] = {"max_frames": 2}
-    project.objects = HEADER + "shed\tyard\tclose\tfiducials.tsv\tprompts.tsv\t\t\n"
+    project.objects = HEADER + "shed\tyard\tclose\tfiducials.tsv\tprompts.tsv\t\n"
     for name in ("fiducials", "prompts"):
         click = cells if name == column else "0.jpg\t1\t2"
         (project.path / f"{name}.tsv").write_text(f"label\tphoto\tx_px\ty_px\ninside\t{click}\n")

@@ -11,7 +11,7 @@ from scenefuse.cloud.clouds import Cloud, write_cloud
 
 CLICKS = "label\tphoto\tx_px\ty_px\n" + "".join(f"inside\t0.jpg\t{x}\t20\n" for x in (20, 30, 40))
 """Clicks on an object, in a photo of `Project.photos`."""
-HEADER = "object\tscene\tphotos\tfiducials\tprompts\tmasks\ttruth\n"
+HEADER = "object\tscene\tphotos\tfiducials\tprompts\tmasks\n"
 
 
 def planned(output: str) -> set[str]:
@@ -38,7 +38,7 @@ class Project:
         # Fetches nothing.
         self.config["object"] = {"masks": {"method": "grabcut"}}
         self.scenes = "scene\tphotos\nyard\tflight\n"
-        self.objects = HEADER + "shed\tyard\tclose\tclicks.tsv\tprompts.tsv\t\t\n"
+        self.objects = HEADER + "shed\tyard\tclose\tclicks.tsv\tprompts.tsv\t\n"
 
     def photos(self, folder: str, count: int = 3) -> None:
         """Make a folder with this many photos of noise."""
@@ -54,7 +54,7 @@ class Project:
         self.photos("close")
         for name in ("clicks.tsv", "prompts.tsv"):
             (self.path / name).write_text(CLICKS)
-        self.objects = HEADER + "".join(f"shed{k}\tyard\tclose\tclicks.tsv\tprompts.tsv\t\t\n" for k in range(objects))
+        self.objects = HEADER + "".join(f"shed{k}\tyard\tclose\tclicks.tsv\tprompts.tsv\t\n" for k in range(objects))
 
     def write(self) -> Path:
         """Write tables and settings; returns the settings file."""

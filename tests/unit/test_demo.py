@@ -13,10 +13,10 @@ from PIL import Image
 
 from demo import capture, clicks, textures
 from demo.bodies import DRONE, IDEAL, PHONE, Body, Exposure, blur_kernel, draw_exposure, expose, vignetting
+from demo.truth import Cameras, pinhole, read_cameras, visible
 from demo.world import ORIGIN, World, build_world, openness
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.marks.clicks import read_points
-from scenefuse.metrics.truth import Cameras, pinhole, read_cameras, visible
 from scenefuse.photos.geodesy import LocalFrame
 
 FLIGHT = capture.FlightSettings(

@@ -46,7 +46,7 @@ def test_of_several_settings_files_the_last_one_counts(yard):
 
 
 def test_masks_of_one_s_own_are_said_to_count_in_the_place_of_clicks(yard):
-    yard.objects = HEADER + "shed\tyard\tclose\tclicks.tsv\tprompts.tsv\tmy masks\t\n"
+    yard.objects = HEADER + "shed\tyard\tclose\tclicks.tsv\tprompts.tsv\tmy masks\n"
     assert any("the column masks is filled (my masks)" in note for note in opened(yard).tables[0].notes)
 
 
@@ -77,7 +77,7 @@ def test_a_photo_that_cannot_be_read_does_not_keep_the_others_waiting(yard):
 
 
 def test_without_cells_tables_lie_beside_the_table_of_objects_and_it_is_said(yard):
-    yard.objects = HEADER + "shed\tyard\tclose\t\t\t\t\n"
+    yard.objects = HEADER + "shed\tyard\tclose\t\t\t\n"
     tables = opened(yard).tables
     assert [table.document.path.name for table in tables] == [
         "shed_prompts.tsv",
@@ -115,7 +115,7 @@ def test_photos_have_the_names_that_the_workflow_gives_them(yard):
 
 def test_frames_of_a_video_are_clicked_in_the_video_s_pixels(yard):
     (yard.path / "walk.mp4").write_bytes(b"video")
-    yard.objects = HEADER + "shed\tyard\twalk.mp4\t\tprompts.tsv\t\t\n"
+    yard.objects = HEADER + "shed\tyard\twalk.mp4\t\tprompts.tsv\t\n"
     with pytest.raises(StageError, match="scenefuse run results/objects/shed/photos.json"):
         opened(yard)
     frames = yard.path / "results/objects/shed/frames"
@@ -129,7 +129,7 @@ def test_frames_of_a_video_are_clicked_in_the_video_s_pixels(yard):
 
 def test_the_only_object_needs_no_name_and_of_two_one_is_named(yard):
     assert Session(None, (yard.write(),)).name == "shed"
-    yard.objects += "barn\tyard\tclose\t\t\t\t\n"
+    yard.objects += "barn\tyard\tclose\t\t\t\n"
     with pytest.raises(StageError, match="say by --object which one of shed, barn"):
         Session(None, (yard.write(),))
 

@@ -303,7 +303,7 @@ def test_a_row_with_a_cloud_needs_no_photos(cloud_project):
 
 
 def test_a_cloud_stands_beside_photos_whose_cameras_are_given(cloud_project):
-    photographed = {"photos": "flight", "cameras": "sparse", "truth": "truth"}
+    photographed = {"photos": "flight", "cameras": "sparse"}
     found = cloud_project(scene=photographed, obj=photographed | {"prompts": "clicks.tsv"})
     assert found.scenes["yard"]["cloud"] == "yard.laz" and found.objects["shed"]["photos"] == "flight"
 
@@ -329,10 +329,6 @@ def test_a_cloud_stands_beside_photos_whose_cameras_are_given(cloud_project):
         ({"obj": {"masks": "masks"}}, "'shed' is a cloud and has no photos that its masks could be for; empty that"),
         ({"obj": {"prompts": "a.tsv"}}, "'shed' is a cloud and has no photos that its prompts could be for"),
         ({"scene": {"calibration": "1 PINHOLE"}}, "'yard' is a cloud and has no photos that its calibration"),
-        (
-            {"obj": {"cloud": "", "photos": "close", "truth": "t"}},
-            "'shed' has a truth, but its scene 'yard' is a cloud",
-        ),
     ],
     ids=[
         "no scene",
@@ -344,7 +340,6 @@ def test_a_cloud_stands_beside_photos_whose_cameras_are_given(cloud_project):
         "masks",
         "prompts",
         "calibration",
-        "truth",
     ],
 )
 def test_a_bad_row_with_a_cloud_is_one_sentence(cloud_project, rows, sentence):

@@ -11,12 +11,8 @@ import pycolmap
 import pytest
 from support.changed_scene import write_changes
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
-from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.core.transforms import Sim3, look_at, rotation_between
-from scenefuse.geometry.visual_hull import mask_iou
-from scenefuse.metrics import truth as tr
-from scenefuse.metrics.evaluate import (
+from demo import truth as tr
+from demo.evaluate import (
     EvaluationInputs,
     around_object,
     evaluate_object,
@@ -24,7 +20,11 @@ from scenefuse.metrics.evaluate import (
     read_object_truth,
     scene_scores,
 )
-from scenefuse.metrics.truth import Cameras, cameras_json, f_score, pinhole, scores_at
+from demo.truth import Cameras, cameras_json, f_score, pinhole, scores_at
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import Sim3, look_at, rotation_between
+from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.photos.pictures import read_gray, write_depth
 
 TRUTH_FROM_OBJECT = Sim3(

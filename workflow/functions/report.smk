@@ -21,6 +21,7 @@ def results_of(wildcards):
         )
         ends = ["dense.ply", "dense.json", "completed.json"]
         scenes[name] = [*SCENE_FILES[given], *chunks, *ends]
+        scenes[name] += ["truth.json"] if is_rendered(row) else []
     for name, row in OBJECTS.items():
         objects[name] = [*OBJECT_FILES[what_is_given(row)], "object.ply"]
         if name in JOINED:
@@ -34,15 +35,27 @@ def results_of(wildcards):
             objects[name] += [
                 f"registration/{variant}/metrics.json" for variant in list(VARIANTS)[1:]
             ]
-    for files, rows in ((scenes, SCENES), (objects, OBJECTS)):
-        for name, row in rows.items():
-            files[name] += ["truth.json"] if row.get("truth") else []
+        if name in JOINED and is_rendered(row) and is_rendered(SCENES[row["scene"]]):
+            objects[name] += ["truth.json"]
     return [
         f"results/{kind}/{name}/{file}"
         for kind, found in (("scenes", scenes), ("objects", objects))
         for name, files in found.items()
         for file in files
     ]
+
+
+def truth_of(row):
+    """The folder with the truth of photos that the demo has rendered."""
+    photos = Path(row["photos"])
+    return str(photos.parents[1] / "truth" / photos.parent.name)
+
+
+def is_rendered(row):
+    """Whether the demo has rendered the photos of a row, so that their truth is known."""
+    if not DEMO or not Path(row.get("photos", "")).match("demo/*/*/photos"):
+        return False
+    return made_here(truth_of(row)) or Path(truth_of(row)).is_dir()
 
 
 def exported_surfaces():

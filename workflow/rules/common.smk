@@ -86,6 +86,8 @@ PAPER = (
     if config["object"]["recipe"] == "paper" and JOINED
     else []
 )
+# A clone has the demo, the installed library does not.
+DEMO = (ROOT / "demo").is_dir()
 if config["gpu"] == "auto":
     config["gpu"] = int(has_gpu())
 # Jobs on one machine share its memory and take turns on its card, unless `--resources` says otherwise; on a cluster, where

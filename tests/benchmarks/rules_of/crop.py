@@ -22,13 +22,13 @@ from scipy.spatial import cKDTree
 from support.planted import plant
 
 from demo.clicks import PromptSettings, clicks_on
+from demo.evaluate import around_object, read_object_truth
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop import crop_cloud, crop_scene
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import CropInputs
-from scenefuse.metrics.evaluate import around_object, read_object_truth
 from scenefuse.photos.workspace import read_views
 
 RESULTS = Path(os.environ.get("RESULTS", "results"))

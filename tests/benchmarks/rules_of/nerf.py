@@ -16,8 +16,8 @@ from typing import Any
 
 from rules import Rule
 
+from demo.evaluate import ObjectTruth, depth_results, read_object_truth
 from scenefuse.core.stage import read_json, value
-from scenefuse.metrics.evaluate import ObjectTruth, depth_results, read_object_truth
 from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe, Schedule

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demo import truth
 from scenefuse.cloud.clouds import Cloud, read_cloud, sampled, sampled_rows
 from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
 from scenefuse.fuse.write import after_fusion
 from scenefuse.geometry.visual_hull import mask_iou
-from scenefuse.metrics import truth
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.pictures import read_depth, read_gray
 from scenefuse.photos.workspace import read_cameras, read_views
