@@ -22,8 +22,15 @@ from scenefuse.crop.crop_cloud import (
     crop_cloud,
     without_strays,
 )
-from scenefuse.geometry.depth_test import CELL_SPACINGS, SURFACE_SPACINGS, Where, depth_buffer, depth_test
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MAX_PHOTOS
+from scenefuse.geometry.depth_test import (
+    CELL_SPACINGS,
+    CONFIRMING_PHOTOS,
+    MAX_PHOTOS,
+    SURFACE_SPACINGS,
+    Where,
+    depth_buffer,
+    depth_test,
+)
 from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
 from scenefuse.geometry.visual_hull import MAX_BEYOND_POINTS, least_framing
 from scenefuse.marks.clicks import Clicks

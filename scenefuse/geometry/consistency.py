@@ -13,7 +13,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.photo_check import MAX_PHOTOS
+from scenefuse.geometry.depth_test import MAX_PHOTOS
 from scenefuse.photos.workspace import View
 
 

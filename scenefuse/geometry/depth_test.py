@@ -24,6 +24,13 @@ from scenefuse.photos.workspace import View, posed_images, read_model, view_of
 # Side of a cell in spacings of the surface's points, so that a surface has no holes between them; and how many spacings
 # behind the nearest points a noisy surface still reaches.
 CELL_SPACINGS, SURFACE_SPACINGS = 2.0, 8.0
+# Photos that must confirm a point for it to be measured; as many of the others count at each offset of a match, since
+# the rest may not see the place (Goesele et al. 2006).
+CONFIRMING_PHOTOS = 3
+# Photos or depth maps that must agree where one may by chance.
+MIN_AGREEING = 2
+# Photos of one side that points are checked in at most.
+MAX_PHOTOS = 64
 # Photos that look along a surface (beyond 75 degrees) show little of it.
 MIN_COSINE = 0.25
 # Below this share of points with a measurement on their rays, depth maps tell nothing of an object.

@@ -12,22 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS, MAX_PHOTOS
+from scenefuse.geometry.depth_test import MIN_AGREEING as MIN_AGREEING
+from scenefuse.photos.pictures import NOISE
 from scenefuse.photos.workspace import View, Workspace
 
-# Steps before and behind the point that are matched too; a step moves a patch by about a pixel in the other photos.
-OFFSETS = 4
-# Photos that must confirm a point for it to be measured; as many of the others count at each offset, since the rest
-# may not see the place (Goesele et al. 2006).
-CONFIRMING_PHOTOS = 3
-# Photos or depth maps that must agree where one may by chance.
-MIN_AGREEING = 2
 # Least weighted NCC of a photo that confirms a point, and by how much more another offset may score.
 MIN_MATCH, MAX_DROP = 0.6, 0.1
 # Largest standard deviation of a measured point in steps along the ray, of about a pixel: windows that match as well
 # farther on measure nothing, sky and blank walls above all.
 MAX_DEVIATION_PX = 1.2
-# Photos of one side that points are checked in at most.
-MAX_PHOTOS = 64
 # Share of the way from a point to its best match by which the point is off; the match is by the rest. This and the
 # next two by the likelihood of the errors of the demo's house and sculpture, once aligned to the truth.
 PEAK_FACTOR = 0.6
@@ -36,8 +30,6 @@ PIXEL_ERROR = 0.07
 # The noise of a match is so many times what independent pixels would give: photos share the reference, and samples
 # beside each other their pixels.
 NOISE_FACTOR = 1.8
-# Grey levels (one standard deviation) that a photo's pixels are off at least.
-NOISE = 1.5
 
 
 @dataclass(frozen=True)
@@ -182,7 +174,7 @@ def halved(photos: Photos) -> Photos:
 def _match(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Matches:
     """`match_in` at one size of the photos."""
     # Numba takes half a second to load, and most jobs that read this module match nothing.
-    from scenefuse.geometry.photo_kernel import match_points
+    from scenefuse.geometry.photo_kernel import OFFSETS, match_points
 
     count = len(points)
     curve, noise = np.full((count, 2 * OFFSETS + 1), -1.0), np.full(count, np.inf)
@@ -211,4 +203,4 @@ def _peak(curve: Array) -> Array:
     before, middle, after = (curve[rows, best + k] for k in (-1, 0, 1))
     bend = before - 2 * middle + after
     part = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
-    return np.asarray(best + np.clip(part, -1, 1) - OFFSETS, dtype=np.float64)
+    return np.asarray(best + np.clip(part, -1, 1) - curve.shape[1] // 2, dtype=np.float64)

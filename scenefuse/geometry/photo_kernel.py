@@ -5,9 +5,11 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from scenefuse.geometry.depth_test import MIN_COSINE
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, NOISE, OFFSETS
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS, MIN_COSINE
+from scenefuse.photos.pictures import NOISE
 
+# Steps before and behind the point that are matched too; a step moves a patch by about a pixel in the other photos.
+OFFSETS = 4
 # Samples on each side of a patch's middle: 7 x 7 of them, a pixel of the sharpest photo apart.
 RADIUS = 3
 # Photos at most that one point is compared in, beside its reference.

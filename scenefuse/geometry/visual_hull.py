@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.photo_check import MIN_AGREEING
+from scenefuse.geometry.depth_test import MIN_AGREEING
 from scenefuse.photos.workspace import View
 
 Mask = NDArray[np.bool_]

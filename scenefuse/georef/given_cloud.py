@@ -15,7 +15,7 @@ from scenefuse.cloud.import_cloud import IMPORTED, MIN_POINTS, ImportedFile
 from scenefuse.cloud.readers.las import LAS_DIMENSIONS, las_crs
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.visual_hull import MAX_WRONG_SHARE, Outline, count_silhouettes
 from scenefuse.georef.on_cloud import FIT, check_fit, cloud_crs, fit_to_cameras, in_local, misfit
 from scenefuse.photos.cameras.given import read_place

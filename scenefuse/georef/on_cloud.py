@@ -19,8 +19,8 @@ from scenefuse.cloud.import_cloud import crs_of
 from scenefuse.cloud.readers.las import check_projected
 from scenefuse.core.stage import StageError, quantity, threads, value
 from scenefuse.core.transforms import Array, Sim3, box_corners, rotation_angle_deg
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.icp import refine_on_cloud
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.geometry.surface import SAMPLED_POINTS, ends_of
 from scenefuse.georef.placement import middle_of
 from scenefuse.georef.residuals import Georeference

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks
 from scenefuse.masks.grabcut import cleaned
@@ -34,7 +35,6 @@ from scenefuse.masks.votes import (
     vote_shares,
     voter_of,
 )
-from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.photos.workspace import View, Workspace
 
 # Weight of a mask's quality beside its agreement, when one of several is chosen.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError, setting
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import back_project
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.visual_hull import MAX_WRONG_SHARE, Hull, Mask, carve, mask_iou, silhouette
 from scenefuse.marks.clicks import Clicks, ScenePoints
 from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks, clicks_per_photo
@@ -24,7 +25,7 @@ from scenefuse.masks.sam2 import SIDE_PX, Sam2, query_sam2, segment
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
-from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS, select_views
+from scenefuse.mvs.sparse_depths import select_views
 from scenefuse.photos.workspace import Rows, View, Workspace, read_model
 
 # As MAX_WRONG_SHARE, for GrabCut's first masks, and for another hull by which masks are compared: where many lack a

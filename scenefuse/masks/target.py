@@ -10,11 +10,11 @@ from scipy.spatial import ConvexHull, Delaunay
 from scenefuse.cloud.cloud_file import STRAY_PERCENT
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.ground import Ground, fit_ground
 from scenefuse.geometry.surface import SCORE_FRACTION
 from scenefuse.geometry.visual_hull import MAX_BEYOND_POINTS, MIN_OWN_POINTS, NO_POINTS, Box
 from scenefuse.masks.prompts import far_apart
-from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.photos.workspace import View, Workspace
 
 # Sparse points, far apart, that stand for the object where masks voted for thousands.

@@ -9,11 +9,12 @@ from scipy.spatial import QhullError
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.visual_hull import MIN_OWN_POINTS, Mask
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.prompts import POINT_RADIUS_SHARE, Measure, Prompts, distance_to, pixel_of
 from scenefuse.masks.target import in_hull, without_outermost
-from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS, MIN_AGREEMENT
+from scenefuse.mvs.sparse_depths import MIN_AGREEMENT
 from scenefuse.photos.workspace import Workspace
 
 # Points that a photo, or a click outside, is known by.

@@ -20,7 +20,7 @@ from scenefuse.cloud.tiled_cloud import WHOLE, write_tiled
 from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, value, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import DepthMap, Votes, back_project, neighbours, vote
-from scenefuse.geometry.photo_check import MAX_PHOTOS
+from scenefuse.geometry.depth_test import MAX_PHOTOS
 from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.pictures import read_depth, read_normals, read_rgb
 from scenefuse.photos.workspace import View, read_views

@@ -21,7 +21,7 @@ from scenefuse.core.stage import (
     threads,
     write_json,
 )
-from scenefuse.geometry.photo_check import MAX_PHOTOS
+from scenefuse.geometry.depth_test import MAX_PHOTOS
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.sparse_depths import Reference, select_views
 from scenefuse.photos.pictures import read_depth, write_depth, write_normals

@@ -11,7 +11,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import DEPTH_JUMP, Array
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import View, Workspace
 

@@ -21,7 +21,7 @@ from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, quantity, threads, value, write_json
 from scenefuse.core.transforms import DEPTH_JUMP, Sim3
 from scenefuse.geometry.consistency import compare, extent, normals_from_depth, surface_points
-from scenefuse.geometry.photo_check import MIN_AGREEING
+from scenefuse.geometry.depth_test import MIN_AGREEING
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.nerf.appearance import MIN_OPACITY, blurred, falloff_map, fitted_log_gain, gains_nearby
 from scenefuse.nerf.rays import SURFACE_DEPTH, PhotoTensors, dilate

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.surface import ends_of
 from scenefuse.geometry.visual_hull import (
     MIN_OWN_POINTS,

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError
 from scenefuse.photos.photo_files import JPEG, stored_size
 
+# Grey levels (one standard deviation) that a photo's pixels are off at least.
+NOISE = 1.5
 # Loses nothing that SIFT or a mask would notice.
 JPEG_QUALITY = 97
 # Cameras belong to the pixels as they are stored; photos are turned upright once, when they enter (photos.photos).

@@ -13,7 +13,8 @@ from scenefuse.cloud.readers.ply import FIELD, in_file
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Sim3
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MAX_PHOTOS, moved_view, read_photos, showing
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS, MAX_PHOTOS
+from scenefuse.geometry.photo_check import moved_view, read_photos, showing
 from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.workspace import View, Workspace, read_views
 from scenefuse.surface.gltf import metres_per_unit, place_of_scene, write_glb

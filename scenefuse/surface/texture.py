@@ -17,8 +17,7 @@ from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import MARGIN
 from scenefuse.fuse.write import GAINS
-from scenefuse.geometry.depth_test import MIN_COSINE
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS, MIN_COSINE
 from scenefuse.photos.frames import sharpness
 from scenefuse.photos.workspace import View
 from scenefuse.surface.mesh import FaceClass, Rows, Surface, cast, caster, normals_of

@@ -36,8 +36,9 @@ from scenefuse.fuse.fuse_object import uncertainty_on_scene
 from scenefuse.fuse.measure import Evidence
 from scenefuse.fuse.modes import FusionSettings, around, fuse_by_distance, fuse_by_evidence
 from scenefuse.fuse.write import Source, together
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.icp import step_to_planes
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, moved_photos, read_photos
+from scenefuse.geometry.photo_check import moved_photos, read_photos
 from scenefuse.photos.workspace import read_workspace
 from scenefuse.register.uncertainty import Uncertainty
 

@@ -15,7 +15,7 @@ from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.consistency import back_project, compare, normals_from_depth, others, surface_points
-from scenefuse.geometry.photo_check import MAX_PHOTOS
+from scenefuse.geometry.depth_test import MAX_PHOTOS
 from scenefuse.nerf import field, render
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.rays import LossWeights, dilate, draw_batch, pixel_pool
