@@ -1,12 +1,15 @@
-"""Similarities between frames: composing, inverting, fitting, writing.
+"""Similarities between frames: composing, inverting, fitting, writing, and how uncertain one is.
 
 `b_from_a` names a transform, `x_in_b` points. All arithmetic is float64.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from scenefuse.core.stage import quantity
 
 Array = NDArray[np.float64]
 # Opposite to gravity in a levelled frame.
@@ -170,6 +173,75 @@ def apart(pose: "Sim3", other: "Sim3", at: Array) -> Array:
         rotation_angle_deg(other.rotation @ pose.rotation.T),
         np.linalg.norm(other.apply(at) - pose.apply(at)),
     ])  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Standard deviations of a pose.
+
+    Attributes:
+        scale_sd_log: standard deviation of the scale, natural logarithm.
+        rotation_sd_deg: standard deviation of the rotation about its least certain axis, degrees.
+        rotation_axis: (3,) that axis, in the scene.
+        translation_sd: standard deviation of the object's centre along its least certain direction, scene units.
+        covariance: (7, 7) of rotation vector (radians), translation (scene units) and log scale, about that centre.
+    """
+
+    scale_sd_log: float
+    rotation_sd_deg: float
+    rotation_axis: Array
+    translation_sd: float
+    covariance: Array
+
+    @classmethod
+    def of(cls, covariance: Array) -> "Uncertainty":
+        """What a (7, 7) covariance says."""
+        turn, axes = np.linalg.eigh(covariance[:3, :3])
+        return cls(
+            float(np.sqrt(max(covariance[6, 6], 0))),
+            float(np.degrees(np.sqrt(max(turn[-1], 0)))),
+            axes[:, -1],
+            float(np.sqrt(max(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1], 0))),
+            covariance,
+        )
+
+    @classmethod
+    def even(cls, scale_sd_log: float, rotation_sd_deg: float, translation_sd: float) -> "Uncertainty":
+        """The same in all directions."""
+        variances = np.array([np.radians(rotation_sd_deg)] * 3 + [translation_sd] * 3 + [scale_sd_log]) ** 2
+        return cls(scale_sd_log, rotation_sd_deg, UP, translation_sd, np.diag(variances))
+
+    def size(self, diagonal: float) -> float:
+        """One number to compare by: how far it moves a point half a diagonal off the centre, over the diagonal."""
+        turn, shift = np.radians(self.rotation_sd_deg) / 2, self.translation_sd / diagonal
+        return float(np.sqrt((self.scale_sd_log / 2) ** 2 + turn**2 + shift**2))
+
+    @property
+    def deviations(self) -> Array:
+        """(3,) standard deviations of log scale, of the rotation (degrees) and of the shift (scene units)."""
+        return np.array([self.scale_sd_log, self.rotation_sd_deg, self.translation_sd])
+
+    def with_difference(self, pose: Sim3, other: Sim3, at: Array) -> "Uncertainty":
+        """With the difference of two estimates of the pose, taken at (3,) in the object's frame, added in squares."""
+        return Uncertainty.even(*np.hypot(self.deviations, apart(pose, other, at)))
+
+    def unless_apart(self, pose: Sim3, other: Sim3, at: Array, of_other: "Uncertainty") -> "Uncertainty":
+        """At least what two estimates differ by beyond the other's own uncertainty; see `with_difference`."""
+        beyond = np.sqrt(np.maximum(apart(pose, other, at) ** 2 - of_other.deviations**2, 0))
+        if (beyond <= self.deviations).all():
+            return self
+        return Uncertainty.even(*np.maximum(self.deviations, beyond))
+
+
+def uncertainty_quantities(uncertainty: Uncertainty | None, length: str) -> dict[str, Any]:
+    """A pose's uncertainty as a stage JSON holds it; null where it is not known."""
+    u = uncertainty
+    return {
+        "scale_sd_log": quantity(None if u is None else u.scale_sd_log, "1"),
+        "rotation_sd_deg": quantity(None if u is None else u.rotation_sd_deg, "deg"),
+        "translation_sd": quantity(None if u is None else u.translation_sd, length),
+        "covariance": quantity(None if u is None else u.covariance, f"radians, {length}, log scale"),
+    }
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:

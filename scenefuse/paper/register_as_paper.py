@@ -24,7 +24,7 @@ import numpy as np
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import quantity, write_json
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import Array, Sim3, uncertainty_quantities
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import SCORE_FRACTION
 from scenefuse.register.coarse import coarse_quantities
@@ -39,7 +39,6 @@ from scenefuse.register.problem import (
     scale_quantities,
 )
 from scenefuse.register.score import Hypothesis, score
-from scenefuse.register.uncertainty import uncertainty_quantities
 
 # The paper's: the voxel as a share of the diagonal.
 VOXEL_FRACTION = 0.04

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import atomic_file, quantity, read_json, value, write_json
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import Array, Sim3, uncertainty_quantities
 from scenefuse.geometry.depth_test import FreeSpace, read_free_space
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import SAMPLED_POINTS, SCORE_FRACTION
@@ -19,7 +19,7 @@ from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.problem import Constraints, Inputs, Problem, read_alignment
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.score import Hypothesis
-from scenefuse.register.uncertainty import uncertainty_quantities, with_bending
+from scenefuse.register.uncertainty import with_bending
 
 # Photos whose depth maps give the free space; more look from sides that these have seen.
 FREE_SPACE_PHOTOS = 12

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.core.stage import threads
-from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3
+from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3, Uncertainty
 from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, change_between, moved_about, similarity_rows
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface
 from scenefuse.register.score import MIN_COLOR_NOISE
-from scenefuse.register.uncertainty import Uncertainty
 
 # Object points from which a scene point may come: those within two deviations, at the usual spacing and noise.
 NEIGHBOURS = 24

@@ -9,11 +9,10 @@ from scipy.spatial import ConvexHull, QhullError
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, voxel_downsample
 from scenefuse.core.stage import StageError, quantity, read_json, value
-from scenefuse.core.transforms import UP, Array, Sim3, along_a_line, apart, rotation_between
+from scenefuse.core.transforms import UP, Array, Sim3, Uncertainty, along_a_line, apart, rotation_between
 from scenefuse.geometry.depth_test import FreeSpace
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare
-from scenefuse.register.uncertainty import Uncertainty
 from scenefuse.sfm.gravity import UNSURE_CUES
 
 # Points kept of either cloud. The polish queries a quarter of them; the search, in which poses differ grossly, keeps a

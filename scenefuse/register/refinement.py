@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import Array, Sim3, Uncertainty
 from scenefuse.geometry.icp import refine_planes, refine_points
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare, with_grid, with_queries
 from scenefuse.register.coarse import Candidate
@@ -33,7 +33,7 @@ from scenefuse.register.score import (
     displaced_share,
     score,
 )
-from scenefuse.register.uncertainty import Uncertainty, common_error, with_bending
+from scenefuse.register.uncertainty import common_error, with_bending
 
 # First pairing distance, as a share of the diagonal: of poses that differ by less, one finds the other.
 START_FRACTION = DISTINCT_SHIFT

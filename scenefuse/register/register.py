@@ -12,7 +12,7 @@ from scenefuse.cloud.clouds import Cloud, has_unit_normals, read_cloud, sampled_
 from scenefuse.cloud.readers.text import TEXTS
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity
-from scenefuse.core.transforms import UP, Array, Sim3
+from scenefuse.core.transforms import UP, Array, Sim3, uncertainty_quantities
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import MIN_POINTS, around_marks, crop_marked
 from scenefuse.geometry.icp import ScaleRange
@@ -24,7 +24,6 @@ from scenefuse.register.places import MAX_PLACES, likely_places
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, estimates, prior
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.score import DISTINCT_SHIFT, AgreementSettings, Hypothesis, lead, registration_metrics
-from scenefuse.register.uncertainty import uncertainty_quantities
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
 SEARCHED_POINTS = 500_000

@@ -31,7 +31,7 @@ from demo.evaluate import (
 from demo.truth import THRESHOLDS, read_cameras, registration_error
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.core.stage import StageError, read_json, run, threads, value
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import Array, Sim3, Uncertainty
 from scenefuse.fuse.fuse_object import uncertainty_on_scene
 from scenefuse.fuse.measure import Evidence
 from scenefuse.fuse.modes import FusionSettings, around, fuse_by_distance, fuse_by_evidence
@@ -40,7 +40,6 @@ from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.icp import step_to_planes
 from scenefuse.geometry.photo_check import moved_photos, read_photos
 from scenefuse.photos.workspace import read_workspace
-from scenefuse.register.uncertainty import Uncertainty
 
 # Points drawn on the true surface, as the workflow's evaluation draws them.
 SAMPLES = 60000

@@ -20,9 +20,9 @@ from support.planted_photos import PhotoTrial, fitted, truth
 
 from scenefuse.core.stage import run, value
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.register.align_models import MAX_ERROR_PX, AlignmentSettings, align_landmarks
-from scenefuse.register.landmarks import match_landmarks
-from scenefuse.register.reprojection import match_errors, observations
+from scenefuse.georef.align_models import MAX_ERROR_PX, AlignmentSettings, align_landmarks
+from scenefuse.georef.landmarks import match_landmarks
+from scenefuse.georef.reprojection import match_errors, observations
 from scenefuse.sfm.colmap import Freedom, adjustment_options, drop_outliers
 
 # Ids of the object's camera, photos and points in the joint model lie so far above those of the scene's.

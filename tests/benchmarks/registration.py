@@ -18,7 +18,7 @@ from support.planted import AXES, SHAPES, Trial, deviations, errors, plant
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import run
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import Sim3, Uncertainty
 from scenefuse.crop.crop_cloud import CropSettings, crop_cloud
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.paper.register_as_paper import paper_coarse, paper_fine
@@ -26,7 +26,6 @@ from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
-from scenefuse.register.uncertainty import Uncertainty
 
 UP = np.array([0.0, 0.0, 1.0])
 COVERAGES = (0.3, 0.5, 0.7, 0.9)

@@ -17,10 +17,10 @@ from support.planted import AXES, deviations
 from support.planted_photos import PhotoTrial, Truth, truth
 
 from scenefuse.core.stage import run, value
-from scenefuse.core.transforms import Sim3
-from scenefuse.register.align_models import AlignmentSettings, align_landmarks
+from scenefuse.core.transforms import Sim3, Uncertainty
+from scenefuse.georef.align_models import AlignmentSettings, align_landmarks
 from scenefuse.register.decision import MAX_BENT, FineSettings
-from scenefuse.register.uncertainty import Uncertainty, with_bending
+from scenefuse.register.uncertainty import with_bending
 from scenefuse.sfm.spread import Spread, spread_of
 
 # As in registration.py.

@@ -20,7 +20,7 @@ from support.photographed_place import (
 )
 
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.register.landmarks import Landmarks, landmarks_of
+from scenefuse.georef.landmarks import Landmarks, landmarks_of
 from scenefuse.sfm.colmap import adjust, drop_outliers
 from scenefuse.sfm.lens import HELD, Choice, choose_lens
 

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3, rotation_angle_deg
+from scenefuse.georef.align_models import AlignmentSettings, align_models, find_consensus
+from scenefuse.georef.landmarks import match_landmarks, read_landmarks
+from scenefuse.georef.reprojection import match_errors, minimise_reprojection, observations
 from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo
-from scenefuse.register.align_models import AlignmentSettings, align_models, find_consensus
-from scenefuse.register.landmarks import match_landmarks, read_landmarks
-from scenefuse.register.reprojection import match_errors, minimise_reprojection, observations
 
 SETTINGS = AlignmentSettings()
 
@@ -221,7 +221,7 @@ def consensus(pair):
 @pytest.fixture
 def aligned_pair(pair, consensus, tmp_path, monkeypatch):
     """Call it with the files of GPS: the pair's alignment without searching again for what its points agree on."""
-    monkeypatch.setattr("scenefuse.register.align_models.find_consensus", lambda seen, seed: consensus)
+    monkeypatch.setattr("scenefuse.georef.align_models.find_consensus", lambda seen, seed: consensus)
     return lambda files: aligned(tmp_path, *pair, **files)
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from support.planted import errors, plant
 
 from scenefuse.cloud.clouds import Cloud
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import Sim3, Uncertainty
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import Surface
 from scenefuse.register import decision as gate
@@ -29,7 +29,6 @@ from scenefuse.register.score import (
     Score,
     displaced_share,
 )
-from scenefuse.register.uncertainty import Uncertainty
 
 X, Y, Z = np.eye(3)
 SETTINGS = FineSettings()

@@ -7,8 +7,8 @@ import pycolmap
 import pytest
 
 from scenefuse.core.stage import StageError
-from scenefuse.core.transforms import Sim3
-from scenefuse.register.uncertainty import Uncertainty, with_bending
+from scenefuse.core.transforms import Sim3, Uncertainty
+from scenefuse.register.uncertainty import with_bending
 from scenefuse.sfm import spread as bundle
 from scenefuse.sfm.colmap import adjust
 from scenefuse.sfm.features import read_calibration

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from support.planted import deviations, errors, plant
 
+from scenefuse.core.transforms import Uncertainty
 from scenefuse.geometry.icp import ScaleRange, moved_about
 from scenefuse.geometry.surface import prepare, with_queries
 from scenefuse.register import refinement
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.likelihood import certified, explain, most_likely
 from scenefuse.register.problem import Problem
-from scenefuse.register.uncertainty import Uncertainty
 
 SPACING = 0.01  # of the clouds, as a share of the object's diagonal
 OFF = np.array([0.01, -0.01, 0.01, 0, 0, 0, 0.015])

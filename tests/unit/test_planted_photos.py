@@ -12,7 +12,7 @@ from support.planted_photos import Plan, mapped, plant_photos, truth
 
 from scenefuse.core.stage import value
 from scenefuse.core.transforms import Sim3
-from scenefuse.register.align_models import AlignmentSettings, align_landmarks
+from scenefuse.georef.align_models import AlignmentSettings, align_landmarks
 
 SEED = 2
 TINY = Plan(kind="row", scene_photos=16, object_photos=14, alike=80, bend=0.0, noise_px=(0.1, 0.1), points=(1800, 1500))

@@ -11,7 +11,7 @@ from support.planted import errors, plant
 
 from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import Sim3, Uncertainty
 from scenefuse.fuse.write import frame_ledger
 from scenefuse.geometry.depth_test import read_free_space
 from scenefuse.geometry.icp import ScaleRange, refine_planes, refine_points
@@ -31,7 +31,7 @@ from scenefuse.register.fine import register_finely
 from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.score import color_agreement, score
-from scenefuse.register.uncertainty import COMMON_ERROR, Uncertainty, common_error
+from scenefuse.register.uncertainty import COMMON_ERROR, common_error
 
 Z = np.array([0.0, 0.0, 1.0])
 COARSE, FINE = CoarseSettings(), FineSettings()

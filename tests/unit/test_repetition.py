@@ -10,14 +10,13 @@ from support.planted import errors
 
 from demo.objects import box, join, sheet
 from scenefuse.cloud.clouds import Cloud
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import Sim3, Uncertainty
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import prepare
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.problem import Alignment, Constraints, Problem
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.repetition import shifts_onto_itself
-from scenefuse.register.uncertainty import Uncertainty
 
 STEP, BAY = np.array([0.3, 0.0, 0.17]), np.array([2.0, 0.0, 0.0])
 NOTHING, NARROW = Constraints(), ScaleRange(1.0, 0.1)

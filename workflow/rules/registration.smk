@@ -37,8 +37,8 @@ rule align_models:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         seed=config["seed"],
-        script=script("register/align_models.py"),
-        code=code("register/align_models.py"),
+        script=script("georef/align_models.py"),
+        code=code("georef/align_models.py"),
     message:
         "{wildcards.object}: alignment from shared features"
     shell:

@@ -16,14 +16,13 @@ from rules import Rule, without
 from support.planted import SHAPES, errors, plant
 
 from scenefuse.cloud.clouds import Cloud
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import Sim3, Uncertainty
 from scenefuse.geometry.surface import Pairs
 from scenefuse.register import decision, refinement
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.score import Hypothesis
-from scenefuse.register.uncertainty import Uncertainty
 
 UP = np.array([0.0, 0.0, 1.0])
 NAMES = list(SHAPES)

@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import quantity, read_json, value, write_json
-from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3, fit_sim3
+from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3, Uncertainty, fit_sim3, uncertainty_quantities
 from scenefuse.geometry.icp import MAX_TRIPLES, RANSAC_POSES, triples_of_one_scale
+from scenefuse.georef.landmarks import Landmarks, match_landmarks, read_landmarks
 from scenefuse.georef.placement import PHOTOS_OF_ONE_ERROR, GeoreferenceSettings, place_by_gps
+from scenefuse.georef.reprojection import Observations, bootstrap, match_errors, minimise_reprojection, observations
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.photos import gps_accuracies, gps_positions, read_photos
-from scenefuse.register.landmarks import Landmarks, match_landmarks, read_landmarks
-from scenefuse.register.reprojection import Observations, bootstrap, match_errors, minimise_reprojection, observations
-from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities
 from scenefuse.sfm.gravity import estimate_up
 
 # Random triples of matches drawn.

@@ -1,7 +1,7 @@
 """Align the object's sparse model with the scene's by features that their photos share."""
 
 from scenefuse.core.stage import run
-from scenefuse.register.align_models import align_models
+from scenefuse.georef.align_models import align_models
 
 if __name__ == "__main__":
     run(align_models)

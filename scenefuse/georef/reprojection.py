@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import Array, Sim3, Uncertainty
 from scenefuse.geometry.icp import ScaleRange, moved_about, similarity_rows
-from scenefuse.register.landmarks import Landmarks
-from scenefuse.register.uncertainty import Uncertainty
+from scenefuse.georef.landmarks import Landmarks
 
 
 @dataclass(frozen=True)
