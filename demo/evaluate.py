@@ -15,10 +15,10 @@ from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
 from scenefuse.fuse.write import after_fusion
 from scenefuse.geometry.visual_hull import mask_iou
+from scenefuse.mvs.undistort import undistort_picture
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.pictures import read_depth, read_gray
 from scenefuse.photos.workspace import read_cameras, read_views
-from scenefuse.sfm.undistort import undistort_picture
 
 # Photos whose depth maps are compared, spread evenly.
 COMPARED_PHOTOS = 8

@@ -22,6 +22,7 @@ from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
+from scenefuse.mvs.undistort import UndistortSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.object_cloud import CloudSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
@@ -32,7 +33,6 @@ from scenefuse.register.decision import FineSettings
 from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.mapping import MappingSettings
 from scenefuse.sfm.matches import MatchSettings
-from scenefuse.sfm.undistort import UndistortSettings
 
 # Six groups that the rules read themselves; every other setting belongs to a stage, and stands beside it.
 

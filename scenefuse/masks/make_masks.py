@@ -31,12 +31,11 @@ from scenefuse.masks.sam2_weights import WEIGHTS, why_unavailable
 from scenefuse.masks.segmentation import MaskSettings, Prompted, ScoredMasks, masks_from_prompts, score_masks
 from scenefuse.masks.target import target_from_points
 from scenefuse.masks.votes import points_in_masks
+from scenefuse.mvs.undistort import undistort_picture
 from scenefuse.photos.frames import original_sizes
-from scenefuse.photos.photo_files import masks_by_name
-from scenefuse.photos.pictures import write_picture
+from scenefuse.photos.photo_files import masks_by_name, no_match
+from scenefuse.photos.pictures import read_supplied_mask, write_picture
 from scenefuse.photos.workspace import View, Workspace, read_cameras, read_workspace
-from scenefuse.sfm.given_cameras import no_match, read_mask
-from scenefuse.sfm.undistort import undistort_picture
 
 # Width of a photo on the contact sheet, and photos side by side.
 TILE_WIDTH_PX, TILE_COLUMNS = 240, 8
@@ -286,7 +285,7 @@ def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[
             continue
         try:
             camera = originals[view.name]
-            mask = read_mask(file, (camera.width, camera.height)).astype(np.float32)
+            mask = read_supplied_mask(file, (camera.width, camera.height)).astype(np.float32)
             masks[view.name] = undistort_picture(mask, camera, view) > 0.5
         except StageError as error:
             unusable[view.name] = str(error)

@@ -1,1 +1,1 @@
-"""Dense stereo: view selection, plane sweep, depth maps, dense cloud."""
+"""Undistorted photos, and dense stereo: view selection, plane sweep, depth maps, dense cloud."""

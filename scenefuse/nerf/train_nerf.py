@@ -15,15 +15,15 @@ from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.geometry.surface import ends_of
 from scenefuse.mvs.photo_refinement import RefinementSettings
+from scenefuse.mvs.undistort import UndistortSettings
 from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
+from scenefuse.nerf.posed_photos import import_photos
 from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.rendered_maps import RenderedMapSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe
 from scenefuse.photos.pictures import read_depth, read_gray, read_normals, read_rgb
 from scenefuse.photos.sheets import TILE_PX, Image, depth_colors, draw_sheet, save_png
-from scenefuse.sfm.given_cameras import import_photos
-from scenefuse.sfm.undistort import UndistortSettings
 
 
 @dataclass(frozen=True)

@@ -167,6 +167,15 @@ def masks_by_name(photos: Iterable[str], folder: Path) -> dict[str, Path]:
     return {photo: files[name] for photo, name in found.items()}
 
 
+def no_match(folder: Path, photo: str) -> str:
+    """What is wrong with a folder of masks that belong to none of the photos, and what to do; `photo`: name of one."""
+    masks = pictures_below(folder)
+    return (
+        f"masks that match no photo: {len(masks)} masks in {folder} (first: {next(iter(masks), 'none')}), photos are"
+        f" named like {photo}; name a mask like its photo, with or without _mask behind it"
+    )
+
+
 def beside_photos(folder: Path) -> list[str]:
     """Pictures below a folder of photos (paths relative to it) that belong to others by their names: masks, pictures in
     a folder of masks, and those that lie beside the same photo as JPEG."""

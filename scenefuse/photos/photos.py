@@ -17,8 +17,6 @@ from scenefuse.photos.photo_files import FORMATS, JPEG, beside_photos, geo_file,
 from scenefuse.photos.pictures import JPEG_QUALITY, read_raw, stretched
 from scenefuse.photos.positions import check_order, exif_number, exif_text, positions_of, read_geo, stated_position
 
-# Photos and cameras differ in shape by no more than what rounding to whole pixels does.
-SHAPE_TOLERANCE = 0.01
 # SIFT finds next to nothing in photos that use so much fewer bits than their files have: 12 of 16, or the dark 6 of 8.
 MIN_UNUSED_BITS = 2
 # Share of the pixels that may be brighter than what counts as the photo's brightest: hot ones, lamps.

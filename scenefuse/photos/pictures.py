@@ -15,6 +15,8 @@ from scenefuse.photos.photo_files import JPEG, stored_size
 NOISE = 1.5
 # Loses nothing that SIFT or a mask would notice.
 JPEG_QUALITY = 97
+# Photos and cameras differ in shape by no more than what rounding to whole pixels does.
+SHAPE_TOLERANCE = 0.01
 # Cameras belong to the pixels as they are stored; photos are turned upright once, when they enter (photos.photos).
 _STORED = cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -56,6 +58,32 @@ def matte_of(picture: NDArray[Any]) -> NDArray[np.bool_]:
     if np.median(np.abs(channel[::4, ::4] / top - 0.5)) < 0.4:
         raise StageError("it is no mask: most of it is grey")
     return np.asarray(channel > top / 2)
+
+
+def read_supplied_mask(file: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """A mask (H, W), of any size, of a photo of this (width, height).
+
+    Raises:
+        StageError: it cannot be read, or is of another picture.
+    """
+    try:
+        mask = matte_of(read_raw(file))
+    except StageError as error:
+        raise StageError(
+            f"the mask {file} cannot be read ({str(error).split(';')[0]}); export it again as PNG"
+        ) from None
+    (height, width), (photo_width, photo_height) = mask.shape, size
+    if not same_shape((width, height), size):
+        raise StageError(
+            f"the mask {file} is {width} x {height} pixels, its photo {photo_width} x {photo_height}; export it at the"
+            " photo's size"
+        )
+    return mask
+
+
+def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether pictures of these (width, height) may be copies of each other."""
+    return bool(abs(one[0] / one[1] * other[1] / other[0] - 1) <= SHAPE_TOLERANCE)
 
 
 def _even_areas(picture: NDArray[Any], top: int) -> int:

@@ -32,7 +32,7 @@ STAGES = {
     "features": ("extract_object_features-shed0", "sfm/extract_features.py", "photos.json"),
     "matching": ("match_object_features-shed0", "sfm/match_features.py", "features.db"),
     "mapping": ("map_object_photos-shed0", "sfm/map_photos.py", "database.db"),
-    "undistortion": ("undistort_object_photos-shed0", "sfm/undistort_photos.py", "sparse/cameras.bin"),
+    "undistortion": ("undistort_object_photos-shed0", "mvs/undistort_photos.py", "sparse/cameras.bin"),
     "stereo": ("estimate_depth_maps-yard-0", "mvs/estimate_depth_maps.py", "undistorted/sparse/points3D.bin"),
     "masks": ("make_masks-shed0", "masks/make_masks.py", "undistorted.json"),
     "stage-1": ("estimate_depth_prior-shed0", "nerf/estimate_depth_prior.py", "undistorted/sparse/images.bin"),

@@ -15,6 +15,8 @@ import torch
 from scenefuse.core.machine import use_threads
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import run
+from scenefuse.mvs.undistort import UndistortSettings
+from scenefuse.nerf.posed_photos import import_photos
 from scenefuse.nerf.rays import PhotoTensors
 from scenefuse.nerf.render import render_view
 from scenefuse.nerf.rendered_maps import psnr, ssim
@@ -22,8 +24,6 @@ from scenefuse.nerf.train_object_nerf import NerfSettings, photo_tensors
 from scenefuse.nerf.training import Nerf, Training, keep_memory, new_nerf, train
 from scenefuse.nerf.volume import find_volume, silhouettes
 from scenefuse.photos.views import load_views
-from scenefuse.sfm.given_cameras import import_photos
-from scenefuse.sfm.undistort import UndistortSettings
 
 GOALS_DB = (25, 28, 30, 32)
 ROOT = Path(__file__).resolve().parents[2]

@@ -325,7 +325,7 @@ def dense(folder: Path, sparse: Path, report: Path, inputs: list[Any], checkout:
     """Processor time and largest memory from undistorted photos to the cloud."""
     space, maps = folder / "undistorted", folder / "depth"
     used = [
-        timed(folder, "undistort_photos", ["scripts/sfm/undistort_photos.py", *inputs, "--sparse", sparse,
+        timed(folder, "undistort_photos", ["scripts/mvs/undistort_photos.py", *inputs, "--sparse", sparse,
             "--workspace", space, "--report", folder / "undistorted.json"], checkout),
         timed(folder, "estimate_depth_maps", ["scripts/mvs/estimate_depth_maps.py", "--workspace", space, "--chunk", 0,
             "--chunks", 1, "--depth", maps, "--report", folder / "depth.json", "--seed", 0], checkout),

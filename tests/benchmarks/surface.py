@@ -18,9 +18,9 @@ from demo.truth import SAMPLES, Mesh, distances, read_cameras, sample_surface
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.mvs.undistort import undistort_picture
 from scenefuse.photos.pictures import read_gray, read_rgb
 from scenefuse.photos.workspace import read_cameras as cameras_of
-from scenefuse.sfm.undistort import undistort_picture
 from scenefuse.surface.make_surface import SurfaceInputs, mesh_of, placed_views, surface_report
 from scenefuse.surface.mesh import FaceClass, cast, caster
 from scenefuse.surface.texture import textured

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from scenefuse.core.transforms import look_at
+from scenefuse.mvs.undistort import largest_gap
 from scenefuse.report.facts import diagnose, named
 from scenefuse.report.run_summary import ObjectSummary
-from scenefuse.sfm.undistort import largest_gap
 
 GOOD = {
     "sparse.not_registered": [],

@@ -16,7 +16,9 @@ from support.painted_sphere import CENTER, RADIUS, sphere_views
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.mvs.undistort import UndistortSettings
 from scenefuse.nerf.object_cloud import CloudGates
+from scenefuse.nerf.posed_photos import import_photos
 from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.render import RenderedView
 from scenefuse.nerf.rendered_maps import RenderedMapSettings, measure_quality
@@ -26,8 +28,6 @@ from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
 from scenefuse.photos.pictures import matte_of, read_raw
 from scenefuse.photos.views import load_views
-from scenefuse.sfm.given_cameras import import_photos
-from scenefuse.sfm.undistort import UndistortSettings
 
 LEGO = Path(__file__).resolve().parents[3] / "shared/data/lego"
 WIDTH, HEIGHT = 96, 64

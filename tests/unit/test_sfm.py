@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import fit_sim3
 from scenefuse.georef.georeference import camera_poses
+from scenefuse.mvs.undistort import UndistortSettings, undistort_photos, undistort_picture
 from scenefuse.photos.frames import FrameSettings, extract_frames
 from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo, list_photos, read_photos, write_photos
@@ -28,7 +29,6 @@ from scenefuse.sfm.matches import (
     sequential_pairs,
     spatial_pairs,
 )
-from scenefuse.sfm.undistort import UndistortSettings, undistort_photos, undistort_picture
 
 PAIRS = MatchSettings(spatial_from=10, exhaustive_up_to=20, neighbours=3, overlap=2, loop_every=4)
 FEATURES = FeatureSettings(max_image_size_px=1000, max_features=800, first_octave=0, camera_mode="auto")

@@ -1,11 +1,72 @@
-# Multi-view stereo: the scene's depth maps and dense cloud.
+# Multi-view stereo: photos with pinhole cameras of a scene and of an object; the scene's depth maps and dense cloud.
 #
-# INPUTS    results/scenes/{scene}/undistorted/; config: scene
-# OUTPUTS   results/scenes/{scene}/depth/{chunk}/, depth/{chunk}.json       depth and normal maps
+# INPUTS    results/scenes/{scene}/georeferenced/, results/objects/{object}/sparse/, and their photos; config: scene, object
+# OUTPUTS   .../undistorted/, undistorted.json                              photos with pinhole cameras: a COLMAP workspace
+#           results/scenes/{scene}/depth/{chunk}/, depth/{chunk}.json       depth and normal maps
 #           results/scenes/{scene}/dense.ply, dense.json                    the cloud
 
 
 CHUNKS = range(config["scene"]["chunks"])
+
+
+rule undistort_scene_photos:
+    """Undistort the photos into a COLMAP workspace."""
+    input:
+        folder="results/scenes/{scene}/photos",
+        photos="results/scenes/{scene}/photos.json",
+        model="results/scenes/{scene}/georeferenced",
+        report="results/scenes/{scene}/georeference.json",
+    output:
+        workspace=directory("results/scenes/{scene}/undistorted"),
+        report="results/scenes/{scene}/undistorted.json",
+    log:
+        "results/logs/undistort_scene_photos/{scene}.log",
+    benchmark:
+        "results/benchmarks/undistort_scene_photos/{scene}.tsv"
+    priority: 1
+    conda:
+        "../../envs/reconstruction.yaml"
+    threads: SCENE_THREADS
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        upright=lambda wildcards, input: f"--georeference {input.report}",
+        options=settings("scene.undistort"),
+        script=script("mvs/undistort_photos.py"),
+        code=code("mvs/undistort_photos.py"),
+    message:
+        "Scene {wildcards.scene}: undistorting"
+    shell:
+        "exec python {params.script} --folder {input.folder} --photos {input.photos} --sparse {input.model} {params.upright}"
+        " --workspace {output.workspace} --report {output.report} {params.options} &> {log}"
+
+
+use rule undistort_scene_photos as undistort_object_photos with:
+    input:
+        folder="results/objects/{object}/frames",
+        photos="results/objects/{object}/photos.json",
+        model="results/objects/{object}/sparse",
+        report="results/objects/{object}/sparse.json",
+    output:
+        workspace=directory("results/objects/{object}/undistorted"),
+        report="results/objects/{object}/undistorted.json",
+    log:
+        "results/logs/undistort_object_photos/{object}.log",
+    benchmark:
+        "results/benchmarks/undistort_object_photos/{object}.tsv"
+    priority: 0
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 2000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        upright="",
+        options=settings("object.undistort"),
+        script=script("mvs/undistort_photos.py"),
+        code=code("mvs/undistort_photos.py"),
+    message:
+        "{wildcards.object}: undistorting"
 
 
 rule estimate_depth_maps:

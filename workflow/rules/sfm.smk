@@ -8,7 +8,6 @@
 #           results/scenes/{scene}/georeferenced/, georeference.json        the same in metres, z up, adjusted to the survey
 #           results/scenes/{scene}/residuals.tsv                            what is left at control points, check points, positions
 #           .../spread.npz                                                  how far the model may be bent
-#           .../undistorted/, undistorted.json                              photos with pinhole cameras: a COLMAP workspace
 
 
 include: "../functions/sfm.smk"
@@ -334,63 +333,3 @@ use rule estimate_scene_spread as estimate_object_spread with:
         "results/benchmarks/estimate_object_spread/{object}.tsv"
     message:
         "{wildcards.object}: how far the model may be bent"
-
-
-rule undistort_scene_photos:
-    """Undistort the photos into a COLMAP workspace."""
-    input:
-        folder="results/scenes/{scene}/photos",
-        photos="results/scenes/{scene}/photos.json",
-        model="results/scenes/{scene}/georeferenced",
-        report="results/scenes/{scene}/georeference.json",
-    output:
-        workspace=directory("results/scenes/{scene}/undistorted"),
-        report="results/scenes/{scene}/undistorted.json",
-    log:
-        "results/logs/undistort_scene_photos/{scene}.log",
-    benchmark:
-        "results/benchmarks/undistort_scene_photos/{scene}.tsv"
-    priority: 1
-    conda:
-        "../../envs/reconstruction.yaml"
-    threads: SCENE_THREADS
-    resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
-        runtime=lambda wildcards, attempt: 60 * attempt,
-    params:
-        upright=lambda wildcards, input: f"--georeference {input.report}",
-        options=settings("scene.undistort"),
-        script=script("sfm/undistort_photos.py"),
-        code=code("sfm/undistort_photos.py"),
-    message:
-        "Scene {wildcards.scene}: undistorting"
-    shell:
-        "exec python {params.script} --folder {input.folder} --photos {input.photos} --sparse {input.model} {params.upright}"
-        " --workspace {output.workspace} --report {output.report} {params.options} &> {log}"
-
-
-use rule undistort_scene_photos as undistort_object_photos with:
-    input:
-        folder="results/objects/{object}/frames",
-        photos="results/objects/{object}/photos.json",
-        model="results/objects/{object}/sparse",
-        report="results/objects/{object}/sparse.json",
-    output:
-        workspace=directory("results/objects/{object}/undistorted"),
-        report="results/objects/{object}/undistorted.json",
-    log:
-        "results/logs/undistort_object_photos/{object}.log",
-    benchmark:
-        "results/benchmarks/undistort_object_photos/{object}.tsv"
-    priority: 0
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 2000 * attempt,
-        runtime=lambda wildcards, attempt: 30 * attempt,
-    params:
-        upright="",
-        options=settings("object.undistort"),
-        script=script("sfm/undistort_photos.py"),
-        code=code("sfm/undistort_photos.py"),
-    message:
-        "{wildcards.object}: undistorting"

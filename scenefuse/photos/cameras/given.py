@@ -18,7 +18,7 @@ from scenefuse.cloud.crs import plane, to_wgs84, unit_m
 from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.photos.photo_files import MAX_PIXELS
-from scenefuse.photos.photos import SHAPE_TOLERANCE
+from scenefuse.photos.pictures import same_shape
 
 # EXIF orientation -> clockwise quarter turns that stand a stored photo upright; the others are mirrored.
 QUARTERS = {6: 1, 3: 2, 8: 3}
@@ -117,11 +117,6 @@ def largest(models: Mapping[str, Sequence[object]]) -> tuple[str, list[str]]:
     (name, photos), *others = sorted(models.items(), key=lambda model: -len(model[1])) or [("", [])]
     counts = ", ".join(f"{other} with {len(given)}" for other, given in others)
     return name, [f"the model {name} is taken, with {len(photos)} photos, and not {counts}"] if others else []
-
-
-def same_shape(one: Size, other: Size) -> bool:
-    """Whether pictures of these (width, height) may be copies of each other."""
-    return bool(abs(one[0] / one[1] * other[1] / other[0] - 1) <= SHAPE_TOLERANCE)
 
 
 def possible_turns(

@@ -1,7 +1,7 @@
 """Undistort the photos of a sparse model."""
 
 from scenefuse.core.stage import run
-from scenefuse.sfm.undistort import undistort_photos
+from scenefuse.mvs.undistort import undistort_photos
 
 if __name__ == "__main__":
     run(undistort_photos)
