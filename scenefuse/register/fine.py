@@ -44,7 +44,7 @@ class ConstraintFiles:
 
     def bending(self, pose: Sim3, centre: Array) -> tuple[Array | None, Array | None]:
         """(7, 7) covariances of both models around the object's centre (3,), None where they are not known."""
-        from scenefuse.sfm.spread import read_spread
+        from scenefuse.georef.spread import read_spread
 
         places = ((self.object_spread, centre), (self.scene_spread, pose.apply(centre)))
         of_object, of_scene = (None if path is None else read_spread(path).covariance_at(at) for path, at in places)

@@ -8,12 +8,12 @@ import pytest
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3, Uncertainty
+from scenefuse.georef.spread import Spread, read_spread, spread_of, write_spread
 from scenefuse.register.uncertainty import with_bending
 from scenefuse.sfm import spread as bundle
 from scenefuse.sfm.colmap import adjust
 from scenefuse.sfm.features import read_calibration
 from scenefuse.sfm.lens import BROWN, CENTRED, HELD, RADIAL, choose_lens, enrich
-from scenefuse.sfm.spread import Spread, read_spread, spread_of, write_spread
 
 MIDDLE = [700.0, 500.0, 400.0, 0.0]
 

@@ -6,12 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from support.packages import PACKAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = ROOT / "scenefuse"
-# In the order in which data flow; each imports only itself and what stands before it.
-PACKAGES = ["core", "cloud", "photos", "marks", "geometry", "sfm", "georef", "mvs", "masks", "nerf", "crop"]
-PACKAGES += ["register", "fuse", "surface", "metrics", "report", "paper", "pick", "two_clouds"]
 MAY_IMPORT = {name: set(PACKAGES[: PACKAGES.index(name) + 1]) for name in PACKAGES}
 MAY_IMPORT |= {"new_project": {"core", "cloud", "photos"}, "complete": {"core", "report", "new_project"}}
 MAY_IMPORT |= {"command_line": {*PACKAGES, "new_project", "complete"}}

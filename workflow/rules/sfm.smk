@@ -313,8 +313,8 @@ rule estimate_scene_spread:
         mem_mb=by_size(4000, model=8),
         runtime=by_size(240, model=2),
     params:
-        script=script("sfm/estimate_spread.py"),
-        code=code("sfm/estimate_spread.py"),
+        script=script("georef/estimate_spread.py"),
+        code=code("georef/estimate_spread.py"),
     message:
         "Scene {wildcards.scene}: how far the model may be bent"
     shell:
