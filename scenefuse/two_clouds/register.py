@@ -21,7 +21,9 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.core.version import VERSION
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.register.fine import draw_alignment
-from scenefuse.register.register import (
+from scenefuse.report.view import REACH
+from scenefuse.two_clouds.complete import complete, fusion_settings, write_files
+from scenefuse.two_clouds.find import (
     Known,
     Registration,
     RegistrationSettings,
@@ -32,8 +34,6 @@ from scenefuse.register.register import (
     search_box,
     summary,
 )
-from scenefuse.report.view import REACH
-from scenefuse.two_clouds.complete import complete, fusion_settings, write_files
 from scenefuse.two_clouds.page import write_box_page, write_page
 
 NOTHING = Known()

@@ -17,7 +17,7 @@ from scenefuse.cloud.clouds import write_cloud
 from scenefuse.core.stage import run
 
 ROOT = Path(__file__).resolve().parents[2]
-IMPORT = "import scenefuse.register.register"
+IMPORT = "import scenefuse.two_clouds.find"
 
 
 def package(*, runs: int = 3, largest: int = 4) -> None:

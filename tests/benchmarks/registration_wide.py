@@ -17,7 +17,7 @@ from benchmarks.registration import FIRST_REPEAT, METHODS, ROTATION_DEG, SCALE_P
 from support.planted import SHAPES, Trial, errors, plant_wide
 
 from scenefuse.core.stage import run
-from scenefuse.register.register import RegistrationSettings, find_in_scene
+from scenefuse.two_clouds.find import RegistrationSettings, find_in_scene
 
 TIMES, NAMES = (3, 10, 30), list(SHAPES)
 UP = np.array([0.0, 0.0, 1.0])

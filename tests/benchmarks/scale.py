@@ -42,7 +42,7 @@ from scenefuse.register.coarse import CoarseSettings, register_coarsely
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.fine import register_finely
 from scenefuse.register.problem import Inputs, ScaleSettings
-from scenefuse.register.register import Known
+from scenefuse.two_clouds.find import Known
 from scenefuse.two_clouds.register import register as register_files
 
 OBJECT_POINTS = 100_000

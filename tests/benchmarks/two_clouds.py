@@ -20,7 +20,7 @@ from scenefuse.cloud.clouds import read_cloud, write_cloud
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
-from scenefuse.register.register import Known
+from scenefuse.two_clouds.find import Known
 from scenefuse.two_clouds.register import ExitStatus, register
 
 SAMPLES = 60000

@@ -10,8 +10,8 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.register import register
 from scenefuse.register.decision import Decision
 from scenefuse.register.refinement import Outcome
-from scenefuse.register.register import Registration
 from scenefuse.register.score import Hypothesis, Score
+from scenefuse.two_clouds.find import Registration
 
 
 def registered_at_once(monkeypatch, pose: Sim3, registered: bool = True) -> list[tuple[Cloud, Cloud]]:

@@ -10,7 +10,7 @@ from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import read_json, value
 from scenefuse.crop.crop_cloud import CropSettings, crop_cloud
 from scenefuse.crop.crop_scene import CropInputs, crop_scene
-from scenefuse.register.register import cut_scene
+from scenefuse.two_clouds.find import cut_scene
 
 Z = np.array([0.0, 0.0, 1.0])
 SETTINGS = CropSettings()

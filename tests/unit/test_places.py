@@ -12,10 +12,10 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.register import register
 from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import Decision, FineSettings
-from scenefuse.register.places import likely_places
 from scenefuse.register.refinement import Outcome
-from scenefuse.register.register import Registration, RegistrationSettings, find_in_scene
 from scenefuse.register.score import Hypothesis, Score
+from scenefuse.two_clouds.find import Registration, RegistrationSettings, find_in_scene
+from scenefuse.two_clouds.places import likely_places
 
 LITTLE = RegistrationSettings(
     coarse=CoarseSettings(ransac_samples=5000, feature_scale_steps=1, scale_steps=5, candidates=6, keep=2),

@@ -18,7 +18,7 @@ from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.register import Known, RegistrationSettings, find_in_scene
+from scenefuse.two_clouds.find import Known, RegistrationSettings, find_in_scene
 from scenefuse.two_clouds.register import register
 
 ROOT = Path(__file__).resolve().parents[2]
