@@ -7,10 +7,10 @@ import numpy as np
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.icp import ScaleRange
-from scenefuse.register import register
 from scenefuse.register.decision import Decision
 from scenefuse.register.refinement import Outcome
 from scenefuse.register.score import Hypothesis, Score
+from scenefuse.two_clouds import find as register
 from scenefuse.two_clouds.find import Registration
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3, Uncertainty
+from scenefuse.georef import spread as bundle
 from scenefuse.georef.spread import Spread, read_spread, spread_of, write_spread
 from scenefuse.register.uncertainty import with_bending
-from scenefuse.sfm import spread as bundle
 from scenefuse.sfm.colmap import adjust
 from scenefuse.sfm.features import read_calibration
 from scenefuse.sfm.lens import BROWN, CENTRED, HELD, RADIAL, choose_lens, enrich

@@ -9,11 +9,11 @@ from support.planted import plant_wide
 from scenefuse.core.transforms import UP, Sim3
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.geometry.icp import ScaleRange
-from scenefuse.register import register
 from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import Decision, FineSettings
 from scenefuse.register.refinement import Outcome
 from scenefuse.register.score import Hypothesis, Score
+from scenefuse.two_clouds import find as register
 from scenefuse.two_clouds.find import Registration, RegistrationSettings, find_in_scene
 from scenefuse.two_clouds.places import likely_places
 

@@ -25,7 +25,7 @@ from scenefuse.core.stage import StageError, quantity, read_json, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.core.version import VERSION
 from scenefuse.fuse.modes import FusionSettings
-from scenefuse.register import register as register_module
+from scenefuse.two_clouds import find as register_module
 from scenefuse.two_clouds.complete import append_to_las, complete, write_files
 from scenefuse.two_clouds.find import Known
 from scenefuse.two_clouds.page import write_box_page, write_page
