@@ -39,6 +39,8 @@ from scenefuse.photos.workspace import View, Workspace, read_cameras, read_works
 
 # Width of a photo on the contact sheet, and photos side by side.
 TILE_WIDTH_PX, TILE_COLUMNS = 240, 8
+# Photos whose features the network keeps, 17 MB each: an object whose masks disagree is segmented up to four times.
+KEPT_PHOTOS = 100
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,9 @@ def _network(settings: MaskSettings) -> tuple[Sam2 | None, dict[str, Any]]:
         )
         print(fallback, flush=True)
         return None, {"method": quantity("grabcut", ""), "fallback": quantity(fallback, "")}
-    return load_network(threads()), {"method": quantity("sam2", "")}
+    network = load_network(threads())
+    network.kept = KEPT_PHOTOS
+    return network, {"method": quantity("sam2", "")}
 
 
 def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Workspace, dict[str, str]]:

@@ -50,7 +50,7 @@ rule make_masks:
         "../../envs/reconstruction.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=by_photos(4000, 1500, 12, undistorted_photos),
+        mem_mb=by_photos(5000, 3200, 12, undistorted_photos),
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options=mask_options,
