@@ -82,7 +82,9 @@ class LasLayout:
             named = pyproj.CRS.from_user_input(crs)
             header.add_crs(named)
             with suppress(pyproj.exceptions.CRSError):  # LAS asks for WKT 1, which does not know every CRS
-                header.vlrs.get("WktCoordinateSystemVlr")[0].string = named.to_wkt("WKT1_GDAL")
+                # Of axes that begin with the north PROJ writes none, and no longer knows the CRS.
+                if pyproj.CRS.from_wkt(older := named.to_wkt("WKT1_GDAL")) == named:
+                    header.vlrs.get("WktCoordinateSystemVlr")[0].string = older
         # Classes and intensities of LAS stay what they are; of other fields none takes their names.
         own = [name for name, kind in LAS_DIMENSIONS.items() if name in like.fields and like.fields[name].dtype == kind]
         further = [name for name in like.fields if name not in own]
