@@ -187,8 +187,8 @@ def placed_as_given(place: Place, model: pycolmap.Reconstruction, gps: GpsCamera
     there = place.wgs84(corners, "the given cameras")
     frame = replace(local_frame(there), grid=grid_name(place.crs))
     fitted, reason = fit_sim3(corners, frame.apply(there)), f"where its cameras were given, in {place.crs.name}"
+    off = middle_of(frame.apply(gps.positions) - fitted.apply(gps.centres))
     if len(gps.names):
-        off = middle_of(frame.apply(gps.positions) - fitted.apply(gps.centres))
         if np.linalg.norm(off[:2]) > MAX_GPS_OFF_M:
             raise StageError(
                 f"the given cameras lie {np.linalg.norm(off[:2]) / 1000:.3g} km from where the photos' GPS saw them;"
@@ -196,7 +196,8 @@ def placed_as_given(place: Place, model: pycolmap.Reconstruction, gps: GpsCamera
             )
         reason += f" ({np.linalg.norm(off[:2]):.1f} m from the photos' GPS, {-off[2]:+.1f} m in height)"
     none = np.zeros(0, dtype=bool)
-    return Georeference(Placement("georeferenced", reason, fitted, none, "measured", False), frame, gps)
+    placement = Placement("georeferenced", reason, fitted, none, "measured", False, gps_shift=off)
+    return Georeference(placement, frame, gps)
 
 
 def adjust_georeferenced(model: pycolmap.Reconstruction, found: Georeference, freedom: Freedom) -> dict[str, Any]:

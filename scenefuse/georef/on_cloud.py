@@ -186,8 +186,8 @@ def lay_on_cloud(
         heights="measured",
         gps_shift=middle_of(positions - centres),
     )
-    quantities = {"laid_on_cloud_by": quantity(moved.matrix, "m"), "gps_shift": quantity(placement.gps_shift, "m")}
-    return replace(found, placement=placement, frame=frame), quantities | {name: fit[name] for name in FIT}
+    quantities = {"laid_on_cloud_by": quantity(moved.matrix, "m")} | {name: fit[name] for name in FIT}
+    return replace(found, placement=placement, frame=frame), quantities
 
 
 def in_local(points: Array, crs: pyproj.CRS, frame: LocalFrame, where: Path) -> Array:

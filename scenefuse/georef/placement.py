@@ -58,7 +58,7 @@ class Placement:
             frame.
         levelled: whether the cameras say which way is up, not GPS.
         used: (P,) bool over the surveyed points: control points that agree.
-        gps_shift: (3,) metres that GPS positions are off the frame of the control points; zero without these.
+        gps_shift: (3,) metres that GPS positions are off control points, given cameras or a cloud; zero without these.
     """
 
     status: str

@@ -130,6 +130,8 @@ def georeference_report(found: Georeference, left: Residuals, cue: str) -> dict[
         "origin_in_crs": quantity(crs_from_local.translation, frame.crs_unit),
         "crs_from_scene": quantity(crs_from_local.matrix, frame.crs_unit),
     }
+    if placement.gps_shift.any():
+        content["gps_shift"] = quantity(placement.gps_shift, "m")
     if found.control is not None:
         content |= _of_points(found, found.control, left)
     return content | (_of_cameras(found, left) if len(placement.inliers) else {})
@@ -205,8 +207,6 @@ def _of_cameras(found: Georeference, left: Residuals) -> dict[str, Any]:
         # Of a similarity fitted to N positions, each coordinate off by its share of the residual.
         at = found.frame.apply(gps.positions[inliers])[:, :2]
         content["gps_scale_sd_log"] = quantity(horizontal / np.sqrt(2 * ((at - at.mean(0)) ** 2).sum()), "1")
-    if found.control is not None:
-        content["gps_shift"] = quantity(found.placement.gps_shift, "m")
     return content
 
 

@@ -22,6 +22,7 @@ from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.given_cloud import import_posed_cloud
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.photos.geodesy import scene_frame
+from scenefuse.photos.photos import write_photos
 from scenefuse.photos.workspace import read_views
 
 FLIGHT = fly()
@@ -201,13 +202,18 @@ def test_heights_above_a_geoid_that_is_not_installed_are_one_sentence(given):
 
 
 def test_a_project_far_from_its_photos_gps_is_refused(given):
-    place = on_earth("geocentric")
+    place, photos = on_earth("geocentric"), FLIGHT.photos(noise_m=0.1)
+    # GPS may count heights from another zero than the project.
+    higher = [replace(photo, altitude_m=photo.altitude_m + 47) for photo in photos]
+    write_photos(given / "photos.json", higher, given, "photos", [])
     moved = replace(place.earth_from_model, translation=place.earth_from_model.translation + [0, 5000, 0])
     for found in (place, replace(place, earth_from_model=moved)):
         write_json(given / "sparse.json", {"lens": quantity("held", "")} | found.report())
         if found is place:
             georeferenced(given)
-            assert "from the photos' GPS" in value(read_json(given / "georeference.json"), "reason")
+            report = read_json(given / "georeference.json")
+            assert "from the photos' GPS" in value(report, "reason")
+            assert value(report, "gps_shift") == pytest.approx([0, 0, 47], abs=0.5)
         else:
             with pytest.raises(StageError, match="lie .* km from where the photos' GPS saw them"):
                 georeferenced(given)
