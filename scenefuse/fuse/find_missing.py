@@ -98,6 +98,8 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     write_cloud(outputs.missing, missing.cells)
     georeference = read_json(inputs.georeference_json)
     gps_higher = float(value(georeference, "gps_shift")[2]) if "gps_shift" in georeference else 0.0
+    if "heights" in georeference and value(georeference, "heights") == "relative":
+        gps_higher = np.nan
     unit = value(georeference, "length_unit")
     rows = photo_rows(plan, cameras, scene_frame(georeference), gps_higher, unit)
     _write_table(outputs.next_photos, rows)
@@ -167,7 +169,7 @@ def photo_rows(
         plan: the stations.
         close_ups: the object's photos.
         frame: where the scene lies; None where nothing says it.
-        gps_higher: metres by which the flight's GPS counts heights higher than the scene.
+        gps_higher: metres by which the flight's GPS counts heights higher than the scene; NaN where it counts none.
         unit: of the scene's lengths.
     """
     rows, highest = [], max((float(view.centre[2]) for view in close_ups), default=0.0)
@@ -179,7 +181,7 @@ def photo_rows(
             if frame is not None and has_place(frame.crs):
                 latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
                 row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
-                row["altitude_m"] = round(altitude + gps_higher, 3)
+                row |= {"altitude_m": round(altitude + gps_higher, 3)} if np.isfinite(gps_higher) else {}
             row[f"above_highest_close_up_{unit}"] = float(f"{view.centre[2] - highest:.4g}")
             row["heading_deg"] = round(float(np.degrees(np.arctan2(ahead[0], ahead[1]))) % 360, 1)
             row["pitch_deg"] = round(float(np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))), 1)
@@ -202,7 +204,7 @@ def _write_geojson(path: Path, rows: list[dict[str, Any]]) -> None:
     features = [
         {
             "type": "Feature",
-            "geometry": {"type": "Point", "coordinates": [row[k] for k in POSITION]},
+            "geometry": {"type": "Point", "coordinates": [row[k] for k in POSITION if k in row]},
             "properties": {k: v for k, v in row.items() if k not in POSITION and not k.startswith("local_")},
         }
         for row in rows

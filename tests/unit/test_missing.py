@@ -208,6 +208,12 @@ def test_the_stage_writes_cells_photos_and_shares(files):
     assert len(rows) == len(features) == 3 * value(report, "stations") > 0
     assert features[0]["geometry"]["coordinates"] == [float(rows[0][k]) for k in POSITION]
     assert value(report, "of") == "its surface"
+    # Of heights that count from the middle camera no altitude is made.
+    relative = read_json(inputs.georeference_json) | {"heights": quantity("relative", "")}
+    write_json(inputs.georeference_json, relative)
+    find_missing(inputs=inputs, outputs=outputs)
+    features = json.loads(outputs.geojson.read_text())["features"]
+    assert len(features[0]["geometry"]["coordinates"]) == 2 and "altitude" not in outputs.next_photos.read_text()
     find_missing(inputs=replace(inputs, masks=None), outputs=outputs)
     report = read_json(outputs.report)
     assert (
