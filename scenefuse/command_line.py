@@ -127,6 +127,7 @@ def _export() -> None:
     needed = {"cameras": "results/*/*/undistorted", "tiles": "results/scenes/*/completed.ply", "pdf": str(REPORT)}
     what = [item for item in words.what if any(Path().glob(needed.get(item, "*")))]
     targets = {EXPORTS[item].format(object=name, scene=scene) for item in what for name in names for scene in scenes}
+    targets = {t for t in targets if not t.endswith("/tiles") or Path(t).with_name("completed.ply").is_file()}
     run = [sys.executable, "-m", "scenefuse", "run"]
     rules = ["make_surface", "draw_surface", "export_cameras", "make_tiles", "write_pdf"]
     ended = subprocess.run([*run, *sorted(targets), *others, "--allowed-rules", *rules]).returncode

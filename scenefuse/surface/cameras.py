@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyproj
 
+from scenefuse.cloud.crs import plane
 from scenefuse.core.stage import StageError, atomic_directory, read_json, value, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.photos.workspace import View, write_model
@@ -86,7 +87,8 @@ def _metashape(views: list[View], earth_from_scene: Array | None, crs: str | Non
         ET.SubElement(transform, "rotation").text = _numbers(earth_from_scene[:3, :3] / scale)
         ET.SubElement(transform, "translation").text = _numbers(earth_from_scene[:3, 3])
         ET.SubElement(transform, "scale").text = repr(scale)
-        ET.SubElement(chunk, "reference").text = pyproj.CRS.from_user_input(crs).to_wkt("WKT1_GDAL")
+        # Its heights lie above the ellipsoid: those of a geoid would be computed once more.
+        ET.SubElement(chunk, "reference").text = plane(pyproj.CRS.from_user_input(crs)).to_wkt("WKT1_GDAL")
     return document
 
 

@@ -18,6 +18,7 @@ from PIL import Image
 from pyproj.database import get_units_map
 
 from scenefuse.cloud.clouds import Cloud
+from scenefuse.cloud.crs import has_place
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.transforms import Array
 from scenefuse.core.version import VERSION
@@ -274,7 +275,7 @@ def earth_from_scene(georeference_json: Path | None) -> Array | None:
     Heights are taken as those above the ellipsoid.
     """
     frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
-    if frame is None or frame.crs is None:
+    if frame is None or not has_place(frame.crs):
         return None
     step = 100.0
     latitude, longitude, height = frame.inverse(step * np.vstack([np.zeros(3), np.eye(3)])).T

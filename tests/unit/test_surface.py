@@ -32,7 +32,7 @@ from scenefuse.report.write_pdf import write_pdf
 from scenefuse.surface import tiles
 from scenefuse.surface.cameras import export_cameras
 from scenefuse.surface.drawings import NOTHING, SIDES, draw, draw_surface, facade_axes, wall_turn
-from scenefuse.surface.gltf import Painted, write_glb
+from scenefuse.surface.gltf import Painted, earth_from_scene, write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
 from scenefuse.surface.mesh import FaceClass, Surface, make_mesh
 from scenefuse.surface.texture import beyond_manifold, textured, unfolded
@@ -381,6 +381,12 @@ def test_a_drawing_from_above_lies_in_the_crs_of_its_scene(placed):
     assert np.isnan(heights[0, 0])
 
 
+def test_a_site_s_own_system_has_no_place_on_earth(tmp_path):
+    site = 'LOCAL_CS["site",UNIT["metre",1],AXIS["X",EAST],AXIS["Y",NORTH]]'
+    write_json(tmp_path / "g.json", GEOREFERENCE | {"crs": quantity(site, "")})
+    assert earth_from_scene(tmp_path / "g.json") is None
+
+
 def test_a_scene_in_metres_is_drawn_from_above_in_the_feet_of_its_crs(coarse, tmp_path):
     place = {"latitude_deg": 37.5, "longitude_deg": -122.0, "altitude_m": 30.48006}
     known = {f"origin_{name}": quantity(number, "") for name, number in place.items()}
@@ -429,11 +435,12 @@ def test_cameras_of_both_sides_are_exported_in_the_frame_of_the_scene(tmp_path: 
     assert matrix[2, 2] > 0.99
 
 
-def test_metashape_reads_the_cameras_and_their_place(tmp_path: Path):
+@pytest.mark.parametrize("crs", ["EPSG:25832", "EPSG:25832+7837"])
+def test_metashape_reads_the_cameras_and_their_place(tmp_path: Path, crs):
     workspace, folder = tmp_path / "scenes/yard/undistorted", tmp_path / "scenes/yard/cameras"
     (workspace / "sparse").mkdir(parents=True)
     write_model(workspace / "sparse", from_above(3))
-    write_json(tmp_path / "g.json", GEOREFERENCE)
+    write_json(tmp_path / "g.json", GEOREFERENCE | {"crs": quantity(crs, "")})
     export_cameras(scene_workspace=workspace, objects=[], georeference_json=tmp_path / "g.json", folder=folder)
     found = {given.name: given for given in read_metashape(folder / "cameras.xml")[0]}
     for view in from_above(3):
@@ -442,10 +449,10 @@ def test_metashape_reads_the_cameras_and_their_place(tmp_path: Path):
         assert np.allclose(lens.calibration_matrix(), view.intrinsics)
     place = metashape_place(folder / "cameras.xml")
     assert place is not None and place.crs.to_epsg() == 25832
-    easting, northing, _ = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:25832").transform(
+    easting, northing, height = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:25832").transform(
         *place.earth_from_model.translation
     )
-    assert (easting, northing) == pytest.approx((500100, 5200200), abs=0.01)
+    assert (easting, northing, height) == pytest.approx((500100, 5200200, 300), abs=0.01)
 
 
 def test_tiles_hold_every_point_once_and_lie_where_the_scene_lies(closed, tmp_path: Path, monkeypatch):
@@ -514,6 +521,14 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
     # Nothing was left to do: a run that makes the page prints the closing lines itself.
     exported = "Export: results/objects/shed/surface.glb, results/objects/shed/drawings, results/summary/report.pdf\n"
     assert capsys.readouterr().out == f"{exported}Result: 1; results/summary\n"
+    for scene in ("yard/completed.ply", "field/dense.ply"):
+        (tmp_path / "results/scenes" / scene).parent.mkdir(exist_ok=True)
+        (tmp_path / "results/scenes" / scene).touch()
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "export", "--what", "tiles"])
+    with pytest.raises(SystemExit):
+        command_line.main()
+    assert [word for word in runs[2] if word.endswith("/tiles")] == ["results/scenes/yard/tiles"]
+    (tmp_path / "results/scenes/yard/completed.ply").unlink()
     facade = ["--facade", *["1", "-2", "3", "4", "5", "6", "7", "8", "9.5"]]
     monkeypatch.setattr(sys, "argv", ["scenefuse", "export", *facade])
     with pytest.raises(SystemExit, match="name it by --object"):
