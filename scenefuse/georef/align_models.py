@@ -150,14 +150,15 @@ def align_landmarks(
     print(f"{len(obj.points)} points of the object, {len(scene.points)} of the scene, {len(pairs)} matches", flush=True)
     seen = observations(obj, scene, pairs)
     consensus = find_consensus(seen, seed)
-    centre = np.median(obj.points, axis=0)
+    # Most points of the model may lie far behind the object.
+    centre = obj.looked_at()
     if consensus is None or not consensus.inliers.any():
         nothing = f"{len(pairs)} points of the models look alike, and no three of them fit one similarity"
-        return _report(len(pairs), nothing) | gps_quantities(gps, None, obj.looked_at())
+        return _report(len(pairs), nothing) | gps_quantities(gps, None, centre)
     if gps is not None:
-        consensus = _by_gps(seen, consensus, gps, obj.looked_at(), seed)
+        consensus = _by_gps(seen, consensus, gps, centre, seed)
     inliers = seen.subset(consensus.inliers)
-    near = nearest(inliers, obj.looked_at(), settings.nearest_points)
+    near = nearest(inliers, centre, settings.nearest_points)
     pose = minimise_reprojection(near, consensus.pose, MAX_ERROR_PX / 2)
     drawn = bootstrap(near, pose, MAX_ERROR_PX / 2, centre, BOOTSTRAP_DRAWS, seed)
     # The pose that all points give shows how much the models are bent against each other.
@@ -165,7 +166,7 @@ def align_landmarks(
     consensus = replace(consensus, pose=pose)
     problem = rejection_reason(consensus, inliers, len(pairs), uncertainty, settings)
     found = _report(len(pairs), problem, consensus, inliers, uncertainty)
-    return found | gps_quantities(gps, None if problem else pose, obj.looked_at())
+    return found | gps_quantities(gps, None if problem else pose, centre)
 
 
 def nearest(seen: Observations, place: Array, count: int) -> Observations:

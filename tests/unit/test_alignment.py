@@ -162,6 +162,17 @@ def test_a_scene_that_is_bent_far_away_does_not_bend_the_pose_of_what_the_photos
     assert shifts[0] < 0.5 * shifts[1]
 
 
+def test_how_certain_the_place_is_does_not_depend_on_what_lies_behind_the_object(pair, found, tmp_path):
+    behind, own, strange = world(5, 900, (4, 3, 2)), near(world(1)), world(2, 150, (2, 2, 1))
+    seen = World(
+        np.concatenate([own.points, strange.points, behind.points + [0, 14, 0]]),
+        np.concatenate([own.looks, strange.looks, behind.looks]),
+    )
+    obj = capture(tmp_path, "object", seen, ring(6, 2.5, 10), 4, model_from_world=OBJECT_FROM_WORLD)
+    again = aligned(tmp_path, obj, pair[1])
+    assert value(again, "translation_sd") < 2 * value(found, "translation_sd")
+
+
 def test_the_same_input_gives_the_same_output_and_is_not_written_to(pair, found, tmp_path):
     databases = [side[1] for side in pair]
     for database in databases:
