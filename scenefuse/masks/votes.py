@@ -1,7 +1,7 @@
 """What the masks of photos say of the sparse points, and so of each other."""
 
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +10,12 @@ from scipy.spatial import QhullError
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
-from scenefuse.geometry.visual_hull import MIN_OWN_POINTS, Mask
+from scenefuse.geometry.visual_hull import MIN_OWN_POINTS, MIN_WHOLE_SHARE, Mask, is_whole
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.prompts import POINT_RADIUS_SHARE, Measure, Prompts, distance_to, pixel_of
 from scenefuse.masks.target import in_hull, without_outermost
 from scenefuse.mvs.sparse_depths import MIN_AGREEMENT
-from scenefuse.photos.workspace import Workspace
+from scenefuse.photos.workspace import View, Workspace
 
 # Points that a photo, or a click outside, is known by.
 MIN_KNOWN_POINTS = 4
@@ -89,18 +89,38 @@ def vote_shares(photos: Workspace, made: dict[int, Voter]) -> Array:
         return votes / total
 
 
+def _largest(views: list[View], own: Array) -> float:
+    """How large an object can be: as its largest mask (`pixels`), at the middle depth of its points (N, 3), in their
+    unit; infinite where few photos show it whole."""
+    whole = [view for view in views if is_whole(view.pixels)]
+    if len(whole) < MIN_WHOLE_SHARE * len(views):
+        return np.inf
+    sizes = []
+    for view in whole:
+        rows, columns = (np.flatnonzero(view.pixels.any(axis)) for axis in (1, 0))
+        sizes.append(np.median(view.project(own)[1]) * np.hypot(np.ptp(rows), np.ptp(columns)) / view.intrinsics[0, 0])
+    return float(max(sizes, default=np.inf))
+
+
 def known_points(photos: Workspace, made: dict[int, Voter]) -> NDArray[np.int8]:
     """(P,) 1 for sparse points known to be the object's, -1 for those known not to be, 0 for all others.
 
     A first mask that lacks a part (a wall in the shade) would have all others leave it out. So within the convex
     hull of the object's points no mask says that a point is not on it. Points by stereo are known to be the object's,
     or unknown: they are dense, so a part is full of them, and so is what lies between the object's parts. A click
-    outside overrules all of this.
+    outside overrules all of this. What is farther from the object's middle than it is large is unknown: neighbouring
+    masks that hold the trees behind it all vote for these, and other photos do not see them.
     """
     share = vote_shares(photos, made)
     known = np.where(share >= MIN_AGREEMENT, 1, np.where(share <= 1 - MIN_AGREEMENT, -1, 0)).astype(np.int8)
     rows = [voter.rows for voter in made.values() if voter.can_vote]
     counts = np.bincount(np.concatenate([np.zeros(0, np.int64), *rows]), minlength=len(known))
+    shown = [replace(photos.views[k], pixels=voter.mask) for k, voter in made.items() if voter.can_vote]
+    votes, own = np.flatnonzero(known > 0), photos.points[(known > 0) & (counts >= CONFIRMING_PHOTOS)]
+    if len(shown) >= CONFIRMING_PHOTOS and len(own) >= MIN_OWN_POINTS:
+        near = votes[np.linalg.norm(photos.points[votes] - np.median(own, axis=0), axis=1) <= _largest(shown, own)]
+        known[votes] = 0
+        known[near] = 1
     own = without_outermost(photos.points[(known > 0) & (counts >= CONFIRMING_PHOTOS)])
     if len(own) >= MIN_OWN_POINTS:
         with suppress(QhullError):  # of points in a plane, which enclose nothing

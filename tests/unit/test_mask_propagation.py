@@ -6,7 +6,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from support.planted_ball import HEIGHT, MIDDLE, PHOTOS, WIDTH, BallNetwork, clicks, photos_of_a_ball, true_mask
+from support.planted_ball import (
+    HEIGHT,
+    MIDDLE,
+    PHOTOS,
+    WIDTH,
+    BallNetwork,
+    clicks,
+    photos_of_a_ball,
+    planted_view,
+    true_mask,
+)
 
 from scenefuse.core.stage import StageError
 from scenefuse.geometry.visual_hull import mask_iou
@@ -233,7 +243,8 @@ def test_a_part_that_the_network_prefers_to_leave_out_is_asked_for_alone(photos)
 
 def test_what_the_objects_points_enclose_is_never_said_to_be_outside():
     points = np.concatenate([np.random.default_rng(0).uniform(-1, 1, (300, 3)), [[0, 0, 0.1], [0.1, 0, 0], [5, 5, 5]]])
-    photos, empty = Workspace(Path(), [], points, [], []), np.zeros((HEIGHT, WIDTH), dtype=bool)
+    views, empty = [planted_view(0)] * 3, np.zeros((HEIGHT, WIDTH), dtype=bool)
+    photos = Workspace(Path(), views, points, [], [])
 
     def known(votes):
         rows = np.arange(303)
@@ -246,6 +257,24 @@ def test_what_the_objects_points_enclose_is_never_said_to_be_outside():
     photos = replace(photos, points=np.concatenate([points[200:], points[:200] / 4]), by_stereo=200)
     voter = Voter(empty, 0.9, 1.0, np.arange(303), np.arange(303) < 100, NO_CLICKS)
     assert known_points(photos, dict.fromkeys(range(3), voter))[100:].tolist() == [0, 0, -1] + [0] * 200
+
+
+def test_what_is_farther_off_than_the_object_is_large_is_not_known_to_be_its_own(photos):
+    """All photos' masks hold points of the shell, twelve radii away, wherever they see them."""
+
+    def known(masks):
+        voters = {
+            k: Voter(mask, 0.9, 1.0, photos.seen[k], photos.seen[k] < 700, NO_CLICKS) for k, mask in enumerate(masks)
+        }
+        kind = known_points(photos, voters)
+        return kind[:600], kind[600:700][np.isin(np.arange(600, 700), np.concatenate(photos.seen))]
+
+    ball, shell = known([true_mask(view) for view in photos.views])
+    assert (ball[np.unique(np.concatenate(photos.seen)[np.concatenate(photos.seen) < 600])] == 1).all()
+    assert len(shell) and (shell == 0).all()
+    # Where masks end with their photos, nobody knows how large it is.
+    ball, shell = known([np.ones((HEIGHT, WIDTH), dtype=bool)] * PHOTOS)
+    assert (shell == 1).all()
 
 
 def test_a_click_outside_counts_in_all_photos_whatever_their_masks_hold(photos):
