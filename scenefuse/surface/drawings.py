@@ -207,7 +207,8 @@ def draw_surface(
             title = f"{name} {where}{azimuth}"
             title += f"; 1:{scale}" if unit != "scene units" else ""
             left = drawing.left + shift[0] if side == "above" else 0.0
-            figure = _sheet(drawing, title, counted, metres / ratio / scale, (left, drawing.top + shift[1]))
+            note = "" if crs is None else f"; {pyproj.CRS.from_user_input(crs).name}, north is up"
+            figure = _sheet(drawing, title, counted, metres / ratio / scale, (left, drawing.top + shift[1]), note)
             figure.savefig(output / f"{side}.png", dpi=200)
             pages.savefig(figure)
             report[f"{side}_pixel"], report[f"{side}_scale"] = quantity(drawing.pixel, counted), quantity(scale, "1")
@@ -269,7 +270,9 @@ def _scale(drawing: Drawing, metres: float) -> int:
     return max(1, round(next(k for k in (1, 2, 5, 10) if k * power >= needed) * power))
 
 
-def _sheet(drawing: Drawing, title: str, unit: str, page_per_unit: float, corner: tuple[float, float]) -> Figure:
+def _sheet(
+    drawing: Drawing, title: str, unit: str, page_per_unit: float, corner: tuple[float, float], note: str
+) -> Figure:
     """A page with a frame, a scale bar and tinted bridges.
 
     Args:
@@ -278,6 +281,7 @@ def _sheet(drawing: Drawing, title: str, unit: str, page_per_unit: float, corner
         unit: of lengths.
         page_per_unit: metres of the page for a unit.
         corner: what the frame says of its upper left.
+        note: goes on behind the legend.
     """
     inch = 0.0254
     height, width = (side * drawing.pixel for side in drawing.classes.shape)
@@ -287,6 +291,7 @@ def _sheet(drawing: Drawing, title: str, unit: str, page_per_unit: float, corner
     picture = drawing.colors.copy()
     picture[drawing.classes == FaceClass.BRIDGED, :3] = BRIDGED_TINT
     extent = (corner[0], corner[0] + width, corner[1] - height, corner[1])
+    axes.set_facecolor("0.85")  # a wall may be white
     axes.imshow(picture, extent=extent, interpolation="antialiased")
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.tick_params(labelsize=7)
@@ -296,5 +301,5 @@ def _sheet(drawing: Drawing, title: str, unit: str, page_per_unit: float, corner
     left, low = (1 - size[0]) / 2, (1 - size[1]) / 2 - 0.05
     figure.add_artist(Line2D([left, left + bar * page_per_unit / PAGE[0]], [low, low], color="black", linewidth=4))
     figure.text(left, low + 0.01, f"{bar:g} {unit}", fontsize=8)
-    figure.text(left, low - 0.02, "purple: interpolated; white: not measured", fontsize=8)
+    figure.text(left, low - 0.02, f"purple: interpolated; grey: not measured{note}", fontsize=8)
     return figure

@@ -328,6 +328,15 @@ def placed(coarse, tmp_path_factory):
     return ball_drawn(coarse, folder, georeference_json=folder / "g.json", facade=tuple(CORNERS.ravel()))
 
 
+def test_what_is_not_measured_is_grey_on_a_sheet_for_a_wall_may_be_white(drawings):
+    sheet = np.asarray(Image.open(drawings / "south.png").convert("RGB"))
+    nothing = rasterio.open(drawings / "south_class.tif").read(1) == NOTHING
+    grey = (sheet == 217).all(2).sum() / sheet[:, :, 0].size
+    report = read_json(drawings / "drawings.json")
+    page = 0.42 * 0.297 * value(report, "south_scale") ** 2
+    assert grey == pytest.approx(nothing.sum() * value(report, "south_pixel") ** 2 / page, rel=0.05)
+
+
 def test_an_elevation_has_the_scale_that_it_says(drawings):
     report = read_json(drawings / "drawings.json")
     for side in SIDES:
