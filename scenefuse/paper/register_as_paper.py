@@ -29,7 +29,6 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import SCORE_FRACTION
 from scenefuse.register.coarse import coarse_quantities
 from scenefuse.register.decision import FineSettings, tilt_deg
-from scenefuse.register.fine import draw_alignment, pose_quantities
 from scenefuse.register.problem import (
     SURFACE_POINTS,
     Constraints,
@@ -38,6 +37,7 @@ from scenefuse.register.problem import (
     estimates,
     scale_quantities,
 )
+from scenefuse.register.register_object import draw_alignment, pose_quantities
 from scenefuse.register.score import Hypothesis, score
 
 # The paper's: the voxel as a share of the diagonal.

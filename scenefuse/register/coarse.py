@@ -3,7 +3,6 @@ kept."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,19 +10,13 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.spatial.transform import Rotation
 
-from scenefuse.core.stage import quantity, threads, write_json
+from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.geometry.icp import MAX_TRIPLES, RANSAC_POSES, ScaleRange, refine_points, triples_of_one_scale
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare, with_grid, with_queries
 from scenefuse.register.problem import (
     SURFACE_POINTS,
-    Constraints,
-    Inputs,
     Problem,
-    ScaleSettings,
-    estimates,
-    prior,
-    scale_quantities,
 )
 from scenefuse.register.score import RECALL_WEIGHT, Hypothesis, best_distinct, score
 
@@ -52,38 +45,6 @@ class CoarseSettings:
     """Distinct hypotheses handed to the fine registration."""
 
 
-def register_coarsely(
-    *, inputs: Inputs, scale_report: Path, report: Path, seed: int, scale: ScaleSettings, settings: CoarseSettings
-) -> None:
-    """Estimate the object's scale, and find scene_from_object hypotheses of its pose.
-
-    The scale first, from the clouds' extents, as a prior with a width (method R1 to R3). Then similarity RANSAC on FPFH
-    matches over a pyramid of voxels (R3, R4, R6) and, where gravity is known on both sides, a sweep of yaw, scale and
-    shift by correlation; each is briefly refined and scored both ways (R9).
-
-    Args:
-        inputs: the two clouds and their reports.
-        scale_report: output JSON: `scale`, `width_log` and the `ledger` of all estimates.
-        report: output JSON with `hypotheses`, best first, and the best `scene_from_object`.
-        seed: of all random choices.
-        scale: see ScaleSettings.
-        settings: see CoarseSettings.
-
-    Raises:
-        StageError: a cloud's points lie in one place or along one line.
-    """
-    (obj, scene), ups = inputs.clouds(), inputs.ups()
-    ledger = estimates(obj, scene, ups)
-    problem = Problem(obj, scene, prior(ledger, scale), Constraints(ups), seed)
-    write_json(scale_report, scale_quantities(ledger, problem.scales, scale.method))
-    found, notes = find_hypotheses(problem, settings), []
-    if not found:
-        notes.append("no feature or heading gave a pose; the clouds' centres were laid on each other instead")
-        print(notes[-1], flush=True)
-        found = [_centred(problem)]
-    write_json(report, coarse_quantities(found, problem.known.ups is not None, notes))
-
-
 def coarse_quantities(found: Sequence[Hypothesis], gravity_used: bool, notes: list[str]) -> dict[str, Any]:
     """The stage JSON of hypotheses, best first; each is printed."""
     for h in found:
@@ -96,6 +57,16 @@ def coarse_quantities(found: Sequence[Hypothesis], gravity_used: bool, notes: li
         "hypotheses": quantity([h.as_json() for h in found], ""),
         "notes": quantity(notes, ""),
     }
+
+
+def hypotheses_or_centres(problem: Problem, settings: CoarseSettings) -> tuple[list[Hypothesis], list[str]]:
+    """The hypotheses of `find_hypotheses`, or one where it has none, which a note says."""
+    found = find_hypotheses(problem, settings)
+    if found:
+        return found, []
+    note = "no feature or heading gave a pose; the clouds' centres were laid on each other instead"
+    print(note, flush=True)
+    return [_centred(problem)], [note]
 
 
 def find_hypotheses(problem: Problem, settings: CoarseSettings) -> list[Hypothesis]:

@@ -19,9 +19,9 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.marks.clicks import ScenePoints, read_points
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg
-from scenefuse.register.fine import pose_quantities
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, estimates, prior
 from scenefuse.register.refinement import Outcome, refine_hypotheses
+from scenefuse.register.register_object import pose_quantities
 from scenefuse.register.score import DISTINCT_SHIFT, AgreementSettings, Hypothesis, lead, registration_metrics
 from scenefuse.two_clouds.places import MAX_PLACES, likely_places
 

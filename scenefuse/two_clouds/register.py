@@ -20,7 +20,7 @@ from scenefuse.core.stage import StageError, atomic_file, quantity, value, write
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.core.version import VERSION
 from scenefuse.geometry.icp import ScaleRange
-from scenefuse.register.fine import draw_alignment
+from scenefuse.register.register_object import draw_alignment
 from scenefuse.report.view import REACH
 from scenefuse.two_clouds.complete import complete, fusion_settings, write_files
 from scenefuse.two_clouds.find import (

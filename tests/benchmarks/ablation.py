@@ -19,10 +19,10 @@ from scenefuse.core.settings import ROOT, build
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.paper.register_as_paper import register_as_paper
-from scenefuse.register.coarse import CoarseSettings, register_coarsely
+from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.fine import ConstraintFiles, register_finely
 from scenefuse.register.problem import Inputs, ScaleSettings
+from scenefuse.register.register_object import ConstraintFiles, register_object
 from scenefuse.register.score import AgreementSettings, registration_metrics
 
 OBJECTS = ("house", "balloon", "sculpture")
@@ -40,14 +40,11 @@ def one(results: Path, name: str, variant: str, seed: int, options: dict[str, An
         else:
             depth = tuple(p for p in sorted((scene / "depth").iterdir()) if p.is_dir())
             evidence = ConstraintFiles(folder / "alignment.json", scene / "undistorted", depth)
-            settings = build(CoarseSettings, options.get("coarse", {})), build(FineSettings, options.get("fine", {}))
-            register_coarsely(
-                inputs=inputs, scale_report=scale, report=coarse, seed=seed,
-                scale=build(ScaleSettings, options.get("scale", {})), settings=settings[0],
-            )  # fmt: skip
-            register_finely(
-                inputs=inputs, scale_json=scale, coarse_json=coarse, known=evidence, report=fine, seed=seed,
-                settings=settings[1],
+            register_object(
+                inputs=inputs, known=evidence, scale_report=scale, coarse_report=coarse, report=fine, seed=seed,
+                scale=build(ScaleSettings, options.get("scale", {})),
+                coarse=build(CoarseSettings, options.get("coarse", {})),
+                settings=build(FineSettings, options.get("fine", {})),
             )  # fmt: skip
         found = read_json(fine)
     reference = read_json(folder / "registration/full/crop.json")

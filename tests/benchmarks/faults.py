@@ -41,7 +41,7 @@ STAGES = {
     "stage-4": ("retrain_object_nerf-shed0", "nerf/train_object_nerf.py", "stage3/depth_maps/*"),
     "object-cloud": ("make_object_cloud-shed0", "nerf/make_object_cloud.py", "stage4/depth_maps/*"),
     "crop": ("crop_scene-shed0-full", "crop/crop_scene.py", "dense.ply"),
-    "registration": ("register_finely-shed0-full", "register/register_finely.py", "object.ply"),
+    "registration": ("register_object-shed0-full", "register/register_object.py", "object.ply"),
     "fusion": ("fuse_object-shed0", "fuse/fuse_object.py", "crop.json"),
     "completed-scene": ("complete_scene-yard", "fuse/complete_scene.py", "fused.ply"),
     "report": ("write_report-all", "report/write_report.py", "view.ply"),

@@ -38,10 +38,10 @@ from scenefuse.crop.crop_scene import CropInputs, around_marks, crop_scene
 from scenefuse.fuse.fuse_object import FusionInputs, FusionOutputs, fuse_object
 from scenefuse.fuse.modes import FusionSettings
 from scenefuse.fuse.write import CompletionInputs, complete_scene
-from scenefuse.register.coarse import CoarseSettings, register_coarsely
+from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.fine import register_finely
 from scenefuse.register.problem import Inputs, ScaleSettings
+from scenefuse.register.register_object import register_object
 from scenefuse.two_clouds.find import Known
 from scenefuse.two_clouds.register import register as register_files
 
@@ -197,12 +197,11 @@ def tiles_read(path: Path, low: Array, high: Array) -> int:
 def register(folder: Path) -> None:
     """Scale, coarse and fine registration, as the workflow runs them."""
     inputs = Inputs(object=folder / "object.ply", crop=folder / "crop.ply", crop_json=folder / "crop.json")
-    scale, coarse = folder / "scale.json", folder / "coarse.json"
-    register_coarsely(
-        inputs=inputs, scale_report=scale, report=coarse, seed=0, scale=ScaleSettings(), settings=CoarseSettings()
-    )
-    fine = folder / "house/fine.json"
-    register_finely(inputs=inputs, scale_json=scale, coarse_json=coarse, report=fine, seed=0, settings=FineSettings())
+    register_object(
+        inputs=inputs, scale_report=folder / "scale.json", coarse_report=folder / "coarse.json",
+        report=folder / "house/fine.json", seed=0,
+        scale=ScaleSettings(), coarse=CoarseSettings(), settings=FineSettings(),
+    )  # fmt: skip
 
 
 def command(folder: Path) -> str:

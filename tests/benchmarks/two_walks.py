@@ -13,7 +13,7 @@ from scenefuse.core.stage import run, value
 from scenefuse.core.transforms import Sim3, rotation_angle_deg
 from scenefuse.georef.align_models import AlignmentSettings, align_landmarks
 from scenefuse.georef.landmarks import read_landmarks
-from scenefuse.register.fine import draw_alignment
+from scenefuse.register.register_object import draw_alignment
 from scenefuse.two_clouds.find import RegistrationSettings, find_in_scene
 
 PAIRS = {"south_building": ("walk2", "walk1"), "rock": ("boulder_section", "boulder")}

@@ -94,7 +94,7 @@ def test_only_a_change_of_a_cloud_reruns_its_import(project):
     rules = planned(project("-n").stdout)
     house.write_bytes(before)
     os.utime(house, (1e9, 1e9))
-    assert {"import_object_cloud", "register_finely", "complete_scene"} <= rules
+    assert {"import_object_cloud", "register_object", "complete_scene"} <= rules
     assert not {"import_scene_cloud", "crop_scene"} & rules
 
 

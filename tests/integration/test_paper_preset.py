@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parents[2]
 OF_PAPER = {"estimate_as_paper", "train_nerf_as_paper", "refine_as_paper", "retrain_nerf_as_paper"}
 OF_PAPER |= {"make_cloud_as_paper", "register_variant_as_paper", "compare_with_paper"}
 SHIPPED = {"estimate_depth_prior", "train_object_nerf", "refine_depth", "retrain_object_nerf", "make_object_cloud"}
-SHIPPED |= {"register_coarsely", "register_finely"}
+SHIPPED |= {"register_object"}
 
 
 def test_the_papers_stages_run_in_the_place_of_the_shipped_ones_and_only_when_asked_for(project, snakemake):

@@ -174,7 +174,7 @@ def new_words(source):
         # Not only what runs it: the paper's recipe takes no more than a constant from it, register.py all stages.
         (
             "scenefuse/register/refinement.py",
-            {"register.py", "paper/register_as_paper.py", "register/register_finely.py"},
+            {"register.py", "paper/register_as_paper.py", "register/register_object.py"},
         ),
         ("scenefuse/masks/grabcut.py", {"masks/make_masks.py", "pick.py"}),
         ("scripts/masks/make_masks.py", {"masks/make_masks.py"}),

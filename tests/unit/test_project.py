@@ -112,7 +112,7 @@ def test_reading_the_rules_imports_nothing_heavy():
 @pytest.mark.process
 def test_crops_registration_and_metrics_begin_without_numba_and_torch():
     # Of the jobs of an object with four variants these are a half, each of a few seconds.
-    stages = ("crop.crop_scene", "register.coarse", "register.fine", "metrics.compute_metrics")
+    stages = ("crop.crop_scene", "register.coarse", "register.register_object", "metrics.compute_metrics")
     modules = ", ".join(f"scenefuse.{stage}" for stage in stages)
     source = f"import sys, {modules}\nprint(sorted({{'numba', 'torch', 'open3d', 'pandas'}} & set(sys.modules)))"
     done = subprocess.run(

@@ -23,13 +23,12 @@ from scenefuse.register.coarse import (
     find_hypotheses,
     match,
     ransac_similarities,
-    register_coarsely,
     upright_candidates,
 )
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.fine import register_finely
 from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
+from scenefuse.register.register_object import register_object
 from scenefuse.register.score import color_agreement, score
 from scenefuse.register.uncertainty import COMMON_ERROR, common_error
 
@@ -192,15 +191,19 @@ def stage_inputs(folder, obj, scene, up_in_object=None):
     return Inputs(folder / "object.ply", folder / "crop.ply", folder / "crop.json", folder / "undistorted.json")
 
 
-def test_stages_hand_their_files_on_and_register(tmp_path, house):
+def registered(inputs, folder):
+    """Register an object as the workflow does, with few candidates; writes scale.json, coarse.json and fine.json."""
+    reports = {"scale_report": "scale.json", "coarse_report": "coarse.json", "report": "fine.json"}
+    settings = {"scale": ScaleSettings(), "coarse": LITTLE[0], "settings": LITTLE[1]}
+    register_object(inputs=inputs, **{key: folder / name for key, name in reports.items()}, seed=0, **settings)
+
+
+def test_the_stage_registers_and_reports_its_scale_and_hypotheses(tmp_path, house):
     inputs = stage_inputs(tmp_path, house.object, house.scene, house.up_in_object)
-    scale, coarse, fine = (tmp_path / f"{name}.json" for name in ("scale", "coarse", "fine"))
-    register_coarsely(
-        inputs=inputs, scale_report=scale, report=coarse, seed=0, scale=ScaleSettings(), settings=LITTLE[0]
-    )
-    assert value(read_json(scale), "width_log") == 0.5
-    register_finely(inputs=inputs, scale_json=scale, coarse_json=coarse, report=fine, seed=0, settings=LITTLE[1])
-    content = read_json(fine)
+    registered(inputs, tmp_path)
+    assert value(read_json(tmp_path / "scale.json"), "width_log") == 0.5
+    assert value(read_json(tmp_path / "coarse.json"), "gravity_used")
+    content = read_json(tmp_path / "fine.json")
     assert value(content, "status") == "registered" and value(content, "tilt_deg") < 5
     assert content["translation_sd"]["unit"] == "m" and value(content, "free_space_violation") is None
 
@@ -240,26 +243,19 @@ def test_a_flat_object_keeps_a_sane_scale_prior(scene_thickness):
 
 def test_a_flat_object_ends_in_a_decision(tmp_path):
     inputs = stage_inputs(tmp_path, plate((4, 3)), plate((8, 6), 1), Z)
-    scale, coarse, fine = (tmp_path / f"{name}.json" for name in ("scale", "coarse", "fine"))
-    register_coarsely(
-        inputs=inputs, scale_report=scale, report=coarse, seed=0, scale=ScaleSettings(), settings=LITTLE[0]
-    )
-    register_finely(inputs=inputs, scale_json=scale, coarse_json=coarse, report=fine, seed=0, settings=LITTLE[1])
-    assert value(read_json(fine), "status") in ("registered", "unregistered")
+    registered(inputs, tmp_path)
+    assert value(read_json(tmp_path / "fine.json"), "status") in ("registered", "unregistered")
 
 
 @pytest.mark.parametrize("size, where", [((4, 0), "along one line"), ((0, 0), "in one place")])
 def test_a_line_and_a_point_are_one_sentence(tmp_path, house, size, where):
-    scale, coarse = tmp_path / "scale.json", tmp_path / "coarse.json"
     for inputs in (
         stage_inputs(tmp_path, plate(size), house.scene),
         stage_inputs(tmp_path, house.object, plate(size)),
     ):
         with pytest.raises(StageError, match=f"all 3000 points of .*ply lie {where}"):
-            register_coarsely(
-                inputs=inputs, scale_report=scale, report=coarse, seed=0, scale=ScaleSettings(), settings=COARSE
-            )
-    assert not scale.exists() and not coarse.exists()
+            registered(inputs, tmp_path)
+    assert not [name for name in ("scale", "coarse", "fine") if (tmp_path / f"{name}.json").exists()]
 
 
 def test_frame_ledger_chains_its_transforms(tmp_path):

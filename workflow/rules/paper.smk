@@ -14,8 +14,7 @@ ruleorder: train_nerf_as_paper > train_object_nerf
 ruleorder: retrain_nerf_as_paper > retrain_object_nerf
 ruleorder: import_object_cloud > import_posed_object_cloud > make_cloud_as_paper
 ruleorder: make_cloud_as_paper > make_object_cloud
-ruleorder: register_as_paper > register_variant_as_paper
-ruleorder: register_variant_as_paper > register_coarsely > register_finely
+ruleorder: register_as_paper > register_variant_as_paper > register_object
 
 
 def of_paper(stage):

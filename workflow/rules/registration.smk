@@ -6,7 +6,7 @@
 #
 # `full` is the variant that is fused; the others run beside it by the same scripts, with other options, and are measured at the same
 # thresholds. `paper` has a crop by fiducials, and the paper's recipe is a stage of its own.
-ruleorder: register_as_paper > register_coarsely > register_finely
+ruleorder: register_as_paper > register_object
 
 
 include: "../functions/registration.smk"
@@ -80,50 +80,14 @@ rule crop_scene:
         " --crop {output.crop} --report {output.report} {params.options} &> {log}"
 
 
-rule register_coarsely:
-    """How large the object's unit is in the scene, and hypotheses of its pose there (paper 3.3; R1 to R4, R6)."""
+rule register_object:
+    """Find the object's size and pose in its scene, and register or reject it (paper 3.3; R1 to R4, R6, R8, R9, R12)."""
     input:
         cloud="results/objects/{object}/object.ply",
         cloud_json="results/objects/{object}/object.json",
         crop="results/objects/{object}/registration/{variant}/crop.ply",
         crop_json="results/objects/{object}/registration/{variant}/crop.json",
         workspace_json=if_photographed("results/objects/{object}/undistorted.json"),
-    output:
-        scale="results/objects/{object}/registration/{variant}/scale.json",
-        coarse="results/objects/{object}/registration/{variant}/coarse.json",
-    log:
-        "results/logs/register_coarsely/{object}-{variant}.log",
-    benchmark:
-        "results/benchmarks/register_coarsely/{object}-{variant}.tsv"
-    conda:
-        "../../envs/registration.yaml"
-    threads: min(2, OBJECT_THREADS)
-    resources:
-        mem_mb=by_size(4000, cloud=4, crop=4),
-        runtime=lambda wildcards, attempt: 60 * attempt,
-    params:
-        options=variant_options("scale", "coarse"),
-        gravity=options_of("workspace_json"),
-        seed=config["seed"],
-        script=script("register/register_coarsely.py"),
-        code=code("register/register_coarsely.py"),
-    message:
-        "{wildcards.object}, variant {wildcards.variant}: scale and coarse registration"
-    shell:
-        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " {params.gravity} --scale-report {output.scale} --report {output.coarse} --seed {params.seed} {params.options} &> {log}"
-
-
-rule register_finely:
-    """Refine the hypotheses into one pose, and register or reject it (R8, R9, R12)."""
-    input:
-        cloud="results/objects/{object}/object.ply",
-        cloud_json="results/objects/{object}/object.json",
-        crop="results/objects/{object}/registration/{variant}/crop.ply",
-        crop_json="results/objects/{object}/registration/{variant}/crop.json",
-        workspace_json=if_photographed("results/objects/{object}/undistorted.json"),
-        scale="results/objects/{object}/registration/{variant}/scale.json",
-        coarse="results/objects/{object}/registration/{variant}/coarse.json",
         alignment_json=if_linked("results/objects/{object}/alignment.json"),
         object_spread=if_photographed("results/objects/{object}/spread.npz"),
         scene_spread=in_photographed_scene("spread.npz"),
@@ -131,6 +95,8 @@ rule register_finely:
         depth=in_matched_scene(*(f"depth/{chunk}" for chunk in CHUNKS)),
         depth_json=in_matched_scene(*(f"depth/{chunk}.json" for chunk in CHUNKS)),
     output:
+        scale="results/objects/{object}/registration/{variant}/scale.json",
+        coarse="results/objects/{object}/registration/{variant}/coarse.json",
         fine="results/objects/{object}/registration/{variant}/fine.json",
         picture=report(
             "results/objects/{object}/registration/{variant}/fine.png",
@@ -139,9 +105,9 @@ rule register_finely:
             caption="../report/fine.rst",
         ),
     log:
-        "results/logs/register_finely/{object}-{variant}.log",
+        "results/logs/register_object/{object}-{variant}.log",
     benchmark:
-        "results/benchmarks/register_finely/{object}-{variant}.tsv"
+        "results/benchmarks/register_object/{object}-{variant}.tsv"
     conda:
         "../../envs/registration.yaml"
     threads: min(2, OBJECT_THREADS)
@@ -149,21 +115,20 @@ rule register_finely:
         mem_mb=by_size(4000, cloud=4, crop=4),
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        options=variant_options("fine"),
+        options=variant_options("scale", "coarse", "fine"),
         gravity=options_of("workspace_json"),
         evidence=options_of(
             "alignment_json", "object_spread", "scene_spread", "workspace", "depth"
         ),
         seed=config["seed"],
-        script=script("register/register_finely.py"),
-        code=code("register/register_finely.py"),
+        script=script("register/register_object.py"),
+        code=code("register/register_object.py"),
     message:
-        "{wildcards.object}, variant {wildcards.variant}: fine registration"
+        "{wildcards.object}, variant {wildcards.variant}: registration"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " {params.gravity} --scale-json {input.scale} --coarse-json {input.coarse} {params.evidence}"
-        " --report {output.fine} --picture {output.picture}"
-        " --seed {params.seed} {params.options} &> {log}"
+        " {params.gravity} {params.evidence} --scale-report {output.scale} --coarse-report {output.coarse}"
+        " --report {output.fine} --picture {output.picture} --seed {params.seed} {params.options} &> {log}"
 
 
 rule register_as_paper:

@@ -1,6 +1,6 @@
-"""Fine registration: the stage around `refine_hypotheses`, its report and its picture (method R10, R11)."""
+"""The registration of an object in its scene: the stage, its reports and its picture (method R10, R11)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -8,15 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud
-from scenefuse.core.stage import atomic_file, quantity, read_json, value, write_json
+from scenefuse.core.stage import atomic_file, quantity, write_json
 from scenefuse.core.transforms import Array, Sim3, uncertainty_quantities
 from scenefuse.geometry.depth_test import FreeSpace, read_free_space
-from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import SAMPLED_POINTS, SCORE_FRACTION
 from scenefuse.photos.pictures import write_picture
-from scenefuse.register.coarse import Candidate
+from scenefuse.register.coarse import CoarseSettings, coarse_quantities, hypotheses_or_centres
 from scenefuse.register.decision import FineSettings, tilt_deg
-from scenefuse.register.problem import Constraints, Inputs, Problem, read_alignment
+from scenefuse.register.problem import (
+    Constraints,
+    Inputs,
+    Problem,
+    ScaleSettings,
+    estimates,
+    prior,
+    read_alignment,
+    scale_quantities,
+)
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.score import Hypothesis
 from scenefuse.register.uncertainty import with_bending
@@ -58,50 +66,55 @@ class ConstraintFiles:
         return read_free_space(self.workspace, self.depth, scene.points, FREE_SPACE_PHOTOS, tolerance)
 
 
-def register_finely(
+def register_object(
     *,
     inputs: Inputs,
-    scale_json: Path,
-    coarse_json: Path,
     known: ConstraintFiles = ConstraintFiles(),
+    scale_report: Path,
+    coarse_report: Path,
     report: Path,
     picture: Path | None = None,
     seed: int,
+    scale: ScaleSettings,
+    coarse: CoarseSettings,
     settings: FineSettings,
 ) -> None:
-    """Refine the coarse hypotheses into one pose, or reject it with a reason (method R8, R9, R12).
+    """Find where an object lies in its scene, or reject every pose with a reason.
+
+    The scale first, from the clouds' extents, as a prior with a width (method R1 to R3). Then hypotheses: similarity
+    RANSAC on FPFH matches over a pyramid of voxels (R3, R4, R6) and, where gravity is known on both sides, a sweep of
+    yaw, scale and shift by correlation; each is briefly refined and scored both ways (R9). They are refined into one
+    pose, and that is registered or rejected (R8, R9, R12).
 
     Args:
         inputs: the two clouds and their reports.
-        scale_json: JSON of the scale, of the coarse stage.
-        coarse_json: JSON of the coarse stage.
         known: what is known beside the clouds.
+        scale_report: output JSON: `scale`, `width_log` and the `ledger` of all estimates.
+        coarse_report: output JSON with `hypotheses`, best first, and the best `scene_from_object`.
         report: output JSON: `status`, `reason`, `scene_from_object`, `scale`, scores, every hypothesis.
         picture: output PNG, the object on the scene crop from three sides.
         seed: of all random choices.
+        scale: see ScaleSettings.
+        coarse: see CoarseSettings.
         settings: see FineSettings.
 
     Raises:
         StageError: a cloud's points lie in one place or along one line.
     """
-    obj, scene = inputs.clouds()
-    prior = read_json(scale_json)
+    (obj, scene), ups = inputs.clouds(), inputs.ups()
+    ledger = estimates(obj, scene, ups)
+    problem = Problem(obj, scene, prior(ledger, scale), Constraints(ups), seed)
+    write_json(scale_report, scale_quantities(ledger, problem.scales, scale.method))
+    found, notes = hypotheses_or_centres(problem, coarse)
+    write_json(coarse_report, coarse_quantities(found, ups is not None, notes))
     alignment = read_alignment(known.alignment_json) if settings.use_alignment else None
-    constraints = Constraints(inputs.ups(), known.free_space(scene), alignment)
-    scales = ScaleRange(value(prior, "scale"), value(prior, "width_log"))
-    problem = Problem(obj, scene, scales, constraints, seed)
-    outcome = refine_hypotheses(problem, read_candidates(coarse_json), settings)
+    problem = replace(problem, known=Constraints(ups, known.free_space(scene), alignment))
+    outcome = refine_hypotheses(problem, [(hypothesis.pose, hypothesis.source) for hypothesis in found], settings)
     bending = known.bending(outcome.ranked[0].pose, obj.points.mean(0))
     outcome = outcome.unless_bent(bending[0], scene.diagonal)
     if picture is not None:
         draw_alignment(picture, obj, scene, outcome.ranked[0].pose, seed)
     write_json(report, _report(outcome, problem) | _stated(outcome, bending, inputs.length_unit()))
-
-
-def read_candidates(coarse_json: Path) -> list[Candidate]:
-    """The poses of a coarse stage's JSON, each with its source, best first."""
-    found = value(read_json(coarse_json), "hypotheses")
-    return [(Sim3.from_matrix(np.array(h["scene_from_object"])), h["source"]) for h in found]
 
 
 def _report(outcome: Outcome, problem: Problem) -> dict[str, Any]:
