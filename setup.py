@@ -1,6 +1,6 @@
 """The wheel: beside the library, the files of the workflow, as scenefuse/shipped/; pyproject.toml has all the rest.
 
-The demo is not in it: neither its package nor its tables.
+The demo is not in it: neither its package, its rules and scripts, nor its tables.
 """
 
 from pathlib import Path
@@ -27,7 +27,7 @@ class WithWorkflow(build_py):
         super().run()
         for start in map(Path, SHIPPED):
             for path in [start, *start.rglob("*")]:
-                if path.is_file() and "__pycache__" not in path.parts:
+                if path.is_file() and not {"__pycache__", "demo", "demo.smk"} & set(path.parts):
                     target = Path(self.build_lib, "scenefuse/shipped", path)
                     target.parent.mkdir(parents=True, exist_ok=True)
                     copy2(path, target)

@@ -111,19 +111,21 @@ def installed(wheel, tmp_path_factory):
     return folder
 
 
-def test_a_wheel_holds_the_library_and_the_workflow_and_not_the_tables_of_the_demo(wheel):
+def test_a_wheel_holds_the_library_and_the_workflow_and_nothing_of_the_demo(wheel):
     with zipfile.ZipFile(wheel) as archive:
         held = set(archive.namelist())
     assert wheel.name.startswith(f"scenefuse-{VERSION}-py3-none-any")
     assert {path.relative_to(ROOT).as_posix() for path in ROOT.glob("scenefuse/**/assets/*")} <= held
     for folder in ("scripts", "workflow", "profiles", "envs"):
-        files = [path for path in (ROOT / folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+        files = [path for path in (ROOT / folder).rglob("*") if path.is_file()]
+        files = [path for path in files if not {"__pycache__", "demo", "demo.smk"} & set(path.parts)]
         assert {f"scenefuse/shipped/{path.relative_to(ROOT).as_posix()}" for path in files} <= held
     # Those that messages name.
     assert {"scenefuse/shipped/docs/register.md", "scenefuse/shipped/docs/clicking.md"} <= held
     assert {"scenefuse/shipped/config/README.md", "scenefuse/shipped/Snakefile"} <= held
     assert {"scenefuse/shipped/Snakefile", "scenefuse/shipped/config/config.yaml", "scenefuse/core/stage.py"} <= held
     assert not [name for name in held if name.endswith("/config/objects.tsv") or name.split("/")[0] == "tests"]
+    assert not [name for name in held if "demo" in name]
 
 
 def test_an_installed_package_makes_a_project_and_plans_its_run(installed, tmp_path):
