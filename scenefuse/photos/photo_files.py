@@ -25,12 +25,24 @@ SUFFIXES = (*JPEG, ".png", ".tif", ".tiff", ".bmp", ".ppm")
 FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "BMP", "PPM")
 VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts"}
 # Photos all the same, but in formats that not every stage can decode.
-UNREADABLE = frozenset(
-    (".heic", ".heif", ".avif", ".jxl", ".webp", ".dng", ".raw", ".3fr", ".arw", ".cr2", ".cr3", ".crw")
-)
-UNREADABLE |= frozenset((".gpr", ".iiq", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f"))
-UNREADABLE |= frozenset((".hif", ".mpo", ".jp2", ".j2k", ".jpx", ".gif", ".insp", ".tga", ".dib", ".pgm", ".pnm"))
-UNREADABLE |= frozenset((".rwl", ".sr2", ".mef", ".mrw", ".erf", ".kdc", ".dcr", ".fff"))
+UNREADABLE = {
+    ".heic",
+    ".heif",
+    ".hif",
+    ".avif",
+    ".jxl",
+    ".webp",
+    ".jp2",
+    ".j2k",
+    ".jpx",
+    ".gif",
+    ".tga",
+    ".dib",
+    ".pgm",
+}
+UNREADABLE |= {".pnm", ".mpo", ".insp", ".dng", ".raw", ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".gpr", ".iiq"}
+UNREADABLE |= {".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f", ".rwl", ".sr2", ".mef", ".mrw"}
+UNREADABLE |= {".erf", ".kdc", ".dcr", ".fff"}
 
 # Phones' photos have 200 million pixels. A small file that claims more would fill the memory.
 MAX_PIXELS = 250_000_000
@@ -51,6 +63,8 @@ BUNDLER = ".out"
 COORDS = "odm_georeferencing/coords.txt"
 # What the name of a mask may have more than its photo's: a_mask, a.jpg.mask, a-mask, mask_a.
 MASK = re.compile(r"(.+?)(?:[_. -]mask)+|mask[_. -](.+)", re.DOTALL)
+# What drones take along with a photo of the same number: thermal and multispectral bands.
+BAND = re.compile(r".*?(\d{4,})_(?:(t|ms_\w+|gre|nir|red|reg)|[vwzd]|rgb)", re.DOTALL)
 # What to do about names that do not tell photos apart.
 RENAME = "give the folder that holds the photos alone, or every photo a name of its own"
 
@@ -178,13 +192,16 @@ def no_match(folder: Path, photo: str) -> str:
 
 def beside_photos(folder: Path) -> list[str]:
     """Pictures below a folder of photos (paths relative to it) that belong to others by their names: masks, pictures in
-    a folder of masks, and those that lie beside the same photo as JPEG."""
+    a folder of masks, other bands, and those that lie beside the same photo as JPEG."""
     stems = {name: _stem(name.casefold().rpartition("/")[2]) for name in pictures_below(folder)}
     jpegs = {name.rpartition(".")[0] for name in stems if name.lower().endswith(JPEG)}
     again = [name for name in stems if not name.lower().endswith(JPEG) and name.rpartition(".")[0] in jpegs]
     of = {name: mask[1] or mask[2] for name, stem in stems.items() if (mask := MASK.fullmatch(stem))}
     of = {name: stem for name, stem in stems.items() if re.search(r"(^|/)masks?/[^/]*$", name.casefold())} | of
     photos = {stem for name, stem in stems.items() if name not in of}
+    bands = {name: band for name, stem in stems.items() if (band := BAND.fullmatch(stem))}
+    seen = {band[1] for band in bands.values() if not band[2]}
+    again += [name for name, band in bands.items() if band[2] and band[1] in seen]
     return sorted({*again, *(name for name, stem in of.items() if _stem(stem) in photos)})
 
 

@@ -126,7 +126,7 @@ def distinct_photos(folder: Path) -> tuple[list[str], list[str]]:
     if odd is not None:
         raise StageError(f"{odd!r} in {folder} has a name that lists and tables cannot hold; rename it")
     beside = beside_photos(folder)
-    of = "masks of photos by their names, or these photos in another format"
+    of = "masks or other bands of photos by their names, or these photos in another format"
     notes = [f"{len(beside)} pictures are {of}, and are left out ({beside[0]}, ...)"] if beside else []
     by_size, first_of = dict[int, list[str]](), dict[str, str]()
     for name in sorted(names, key=lambda name: (len(name), name)):
@@ -251,7 +251,10 @@ def inspect_photo(folder: Path, name: str) -> Photo:
         equivalent_mm, focal_mm = (
             max(exif_number(taken.get(tag)) or 0.0, 0.0) for tag in (Base.FocalLengthIn35mmFilm, Base.FocalLength)
         )
-        if b"GPano:ProjectionType" in xmp:
+        if b"BandName" in xmp and len(image.getbands()) == 1:
+            raise ValueError("it is one band of a multispectral camera, and no photo in colours")
+        # The widest cameras take pictures of 65 to 24.
+        if b"GPano:ProjectionType" in xmp or max(image.size) > 3 * min(image.size):
             raise ValueError("it is a panorama, to which no lens is fitted: cut it into views")
         if image.mode in ("F", "I"):
             raise ValueError("its pixels are 32-bit measurements, as a thermal camera's, and no picture")

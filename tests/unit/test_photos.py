@@ -169,7 +169,7 @@ def test_masks_among_photos_are_left_out_and_that_is_said(tmp_path, mask):
     names = [photo.name for photo in listed(tmp_path, folder)]
     assert names == ["IMG_1.JPG", "IMG_2.JPG", "face_mask.JPG", "mask_7.JPG"]
     notes = value(read_json(tmp_path / "photos.json"), "notes")
-    assert any(note.startswith("2 pictures are masks of photos by their names, or") for note in notes)
+    assert any(note.startswith("2 pictures are masks or other bands of photos by their names, or") for note in notes)
 
 
 @pytest.mark.parametrize("focal_35mm", [None, 24])
@@ -203,12 +203,41 @@ def test_photos_of_all_modes_are_turned_and_made_smaller(tmp_path, name, mode, k
     assert pycolmap.Bitmap.read(tmp_path / name, True).width == 15
 
 
-def test_a_panorama_is_named(tmp_path):
-    kind = b'<x:xmpmeta xmlns:x="adobe:ns:meta/" GPano:ProjectionType="equirectangular"/>'
+@pytest.mark.parametrize(
+    ("photo", "bands"),
+    [
+        ("DJI_20240501120000_0001_V", ["DJI_20240501120001_0001_T"]),
+        ("DJI_0001_W", ["thermal/DJI_0001_T"]),
+        ("DJI_0001_D", ["DJI_0001_MS_G", "DJI_0001_MS_NIR"]),
+        ("IMG_170101_0001_RGB", ["IMG_170101_0001_GRE", "IMG_170101_0001_REG"]),
+    ],
+)
+def test_other_bands_of_a_photo_are_left_out_and_bands_alone_stay(tmp_path, photo, bands):
+    folder, alone = tmp_path / "p", bands[0].replace("0001", "0002")
+    for k, name in enumerate([photo, *bands, alone]):
+        save(folder / f"{name}.JPG", (40, 30 + k))
+    assert {found.name for found in listed(tmp_path, folder)} == {f"{photo}.JPG", f"{alone}.JPG"}
+    notes = value(read_json(tmp_path / "photos.json"), "notes")
+    assert any(f"{len(bands)} pictures are masks or other bands" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("mode", "size", "xmp", "sentence"),
+    [
+        ("RGB", (80, 40), b'GPano:ProjectionType="equirectangular"', "it is a panorama"),
+        ("RGB", (130, 40), b"", "it is a panorama"),
+        ("RGB", (118, 40), b'Camera:BandName="RGB"', ""),
+        ("L", (60, 40), b'Camera:BandName="Red"', "it is one band of a multispectral camera"),
+    ],
+)
+def test_panoramas_and_bands_are_named(tmp_path, mode, size, xmp, sentence):
     (tmp_path / "p").mkdir()
-    Image.new("RGB", (80, 40)).save(tmp_path / "p" / "a.jpg", xmp=kind)
-    with pytest.raises(StageError, match="a.jpg cannot be decoded .it is a panorama"):
-        listed(tmp_path, tmp_path / "p")
+    Image.new(mode, size).save(tmp_path / "p" / "a.tif", tiffinfo={700: b"<x " + xmp + b"/>"})
+    if sentence:
+        with pytest.raises(StageError, match=f"a.tif cannot be decoded .{sentence}"):
+            listed(tmp_path, tmp_path / "p")
+    else:
+        assert listed(tmp_path, tmp_path / "p")[0].width == size[0]
 
 
 def test_photos_in_symlinked_folders_are_found_once(tmp_path):
