@@ -131,6 +131,11 @@ def text_layout(path: Path) -> TextLayout:
                 f"{path}: whether column {name} is the easting or the northing cannot be told; name the columns"
                 " Rechtswert and Hochwert"
             )
+        if first == 1 and width > rows.shape[1] == 4:
+            raise StageError(
+                f"{path}: whether its rows are point, easting, northing or point, northing, easting cannot be told;"
+                " write PENZD or PNEZD as its first line"
+            )
         if first == 1:
             what = "names or numbers the points and is left out; the next three are x, y and z"
             notes.append(f"{path.name}: its first column {what}")
