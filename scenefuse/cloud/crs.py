@@ -19,6 +19,7 @@ MAX_BEYOND_DEG = 6.0
 MAX_SITE_COORDINATE = 10_000.0
 # The feet of surveyors and of everybody else differ by less, which is a millimetre of a height.
 MAX_UNIT_RATIO = 1e-5
+MERCATOR = "Mercator's projection, whose metres are no metres on the ground"
 
 
 def read_crs(text: str, where: str) -> pyproj.CRS:
@@ -76,6 +77,8 @@ def usable(crs: pyproj.CRS, where: str, local: bool = False) -> pyproj.CRS:
         )
     if units := mixed_units(crs):
         raise StageError(f"{where}: the CRS {crs.name} counts {units}; give heights in the unit of the plane")
+    if is_stretched(crs):
+        raise StageError(f"{where}: the CRS {crs.name} is {MERCATOR}; give coordinates in another, a UTM zone")
     if not (plane(crs).is_projected or plane(crs).is_geographic or (local and plane(crs).is_engineering)):
         raise StageError(
             f"{where}: the CRS {crs.name} is neither projected nor geographic; give coordinates in such a one"
@@ -117,6 +120,12 @@ def mixed_units(crs: pyproj.CRS) -> str | None:
     found = {axis.unit_name: axis.unit_conversion_factor for axis in crs.axis_info}
     mixed = not plane(crs).is_geographic and max(found.values()) / min(found.values()) - 1 > MAX_UNIT_RATIO
     return " and ".join(sorted(found)) if mixed else None
+
+
+def is_stretched(crs: pyproj.CRS) -> bool:
+    """Whether a CRS is a Mercator projection, in which only the equator has its length."""
+    operation = plane(registered(crs)).coordinate_operation
+    return operation is not None and operation.method_name.startswith(("Mercator", "Popular Visualisation"))
 
 
 def has_place(crs: str | None) -> bool:

@@ -132,6 +132,9 @@ def test_las_without_colours_has_none_and_degrees_are_refused(tmp_path, cloud):
     write_laz(tmp_path / "b.las", Cloud(cloud.points - UTM), np.zeros(3), "EPSG:4326")
     with pytest.raises(StageError, match=r"b\.las is in degrees"):
         read_cloud(tmp_path / "b.las")
+    write_laz(tmp_path / "c.las", Cloud(cloud.points - UTM), UTM, "EPSG:3857+5703")
+    with pytest.raises(StageError, match=r"c\.las is in Mercator's projection, whose metres are no metres"):
+        read_cloud(tmp_path / "c.las")
 
 
 def test_las_of_eight_bit_colours_is_not_darkened(tmp_path):

@@ -1,5 +1,6 @@
 """LAS and LAZ read: points, what the format says of them, and the coordinate system."""
 
+import io
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
@@ -34,14 +35,14 @@ def las_crs(path: Path) -> "pyproj.CRS | None":
 
 
 def check_projected(path: Path) -> None:
-    """StageError where a LAS or LAZ file is in degrees."""
+    """StageError where a LAS or LAZ file is in degrees, geocentric or stretched."""
+    from scenefuse.cloud.crs import MERCATOR, is_stretched
+
     crs = las_crs(path)
-    if crs is not None and crs.is_geocentric:
-        raise StageError(
-            f"{path} is in geocentric coordinates ({crs.name}), with z along the earth's axis; project it first"
-        )
-    if crs is not None and crs.is_geographic:
-        raise StageError(f"{path} is in degrees ({crs.name}); project it to metres first, to UTM for instance")
+    if crs is not None and (crs.is_geocentric or crs.is_geographic or is_stretched(crs)):
+        why = "geocentric coordinates, with z along the earth's axis" if crs.is_geocentric else "degrees"
+        why = MERCATOR if is_stretched(crs) else why
+        raise StageError(f"{path} is in {why} ({crs.name}); project it to metres first, to UTM for instance")
 
 
 def las_dimensions(path: Path) -> list[str]:
@@ -90,7 +91,8 @@ def _packed(path: Path, header: Any) -> int:
     """How many points the chunks of a LAZ hold at least; 0 where it has no table of chunks."""
     import lazrs
 
-    laszip = lazrs.LazVlr(header.vlrs.get("LasZipVlr")[0].record_data)
+    record = header.vlrs.get("LasZipVlr")[0].record_data
+    laszip = lazrs.LazVlr(record)
     with open(path, "rb") as file, suppress(lazrs.LazrsError):
         file.seek(header.offset_to_point_data)
         chunks = lazrs.read_chunk_table(file, laszip)
@@ -100,6 +102,16 @@ def _packed(path: Path, header: Any) -> int:
             if header.point_format.id >= 6:  # behind its first point, a chunk says how many it has
                 file.seek(sum(size for _, size in chunks[:-1]) + laszip.item_size(), 1)
                 counts[-1] = int.from_bytes(file.read(4), "little")
+            elif 0 < (rest := header.point_count - sum(counts[:-1])) <= laszip.chunk_size():
+                # Packed again, the points that are counted are as long as the chunk.
+                points, again = bytearray(rest * laszip.item_size()), io.BytesIO()
+                file.seek(header.offset_to_point_data)
+                reader, writer = lazrs.LasZipDecompressor(file, record), lazrs.LasZipCompressor(again, laszip)
+                reader.seek(header.point_count - rest)
+                reader.decompress_many(points)
+                writer.compress_many(points)
+                writer.done()
+                counts[-1] = rest + (chunks[-1][1] > again.tell())
         return sum(counts)
     return 0
 

@@ -402,17 +402,10 @@ class _Gltf:
 
     def parts(self, node: int, outer: Array) -> list[Mesh]:
         """The triangles below a node, in the frame that `outer` (4, 4) leads to."""
-        from scipy.spatial.transform import Rotation
-
         about = self.document["nodes"][node]
-        if "matrix" in about:
-            own = np.array(about["matrix"], np.float64).reshape(4, 4).T
-        else:
-            own = np.eye(4)
-            turn = Rotation.from_quat(about.get("rotation", [0, 0, 0, 1])).as_matrix()
-            own[:3, :3] = turn * np.array(about.get("scale", [1, 1, 1]))
-            own[:3, 3] = about.get("translation", [0, 0, 0])
-        pose, found = outer @ own, list[Mesh]()
+        own = _poses({part: np.array([about[part.lower()]], float) for part in INSTANCE_PARTS if part.lower() in about})
+        own = np.array(about["matrix"], float).reshape(4, 4).T[None] if "matrix" in about else own
+        pose, found = outer @ own[0], list[Mesh]()
         for primitive in self.document["meshes"][about["mesh"]]["primitives"] if "mesh" in about else []:
             faces = self.faces(primitive)
             if faces is None:
@@ -449,18 +442,8 @@ class _Gltf:
 
     def instances(self, node: dict[str, Any]) -> Array:
         """(N, 4, 4) where copies of a node's mesh stand in it, by EXT_mesh_gpu_instancing."""
-        from scipy.spatial.transform import Rotation
-
         names = node.get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes", {})
-        values = {name: self.values(names[name]) for name in INSTANCE_PARTS if name in names}
-        poses = np.tile(np.eye(4), (len(next(iter(values.values()), [0])), 1, 1))
-        if "ROTATION" in values:
-            poses[:, :3, :3] = Rotation.from_quat(values["ROTATION"]).as_matrix()
-        if "SCALE" in values:
-            poses[:, :3, :3] *= values["SCALE"][:, None]
-        if "TRANSLATION" in values:
-            poses[:, :3, 3] = values["TRANSLATION"]
-        return poses
+        return _poses({name: self.values(names[name]) for name in INSTANCE_PARTS if name in names})
 
     def values(self, accessor: int) -> Array:
         """(N, K) values of an accessor; normalised integers as fractions."""
@@ -524,6 +507,18 @@ class _Gltf:
         place[:2, 2] = texture.get("offset", [0, 0])
         down = np.array([[1.0, 0, 0], [0, -1.0, 1], [0, 0, 1]])  # glTF counts from the upper edge
         return Material(picture, color, (down @ place)[:2])
+
+
+def _poses(parts: dict[str, Array]) -> Array:
+    """(N, 4, 4) of translations, rotations and scales (N, K); one that changes nothing where there are none."""
+    from scipy.spatial.transform import Rotation
+
+    poses = np.tile(np.eye(4), (len(next(iter(parts.values()), [0])), 1, 1))
+    if "ROTATION" in parts:
+        poses[:, :3, :3] = Rotation.from_quat(parts["ROTATION"]).as_matrix()
+    poses[:, :3, :3] *= parts.get("SCALE", np.ones((1, 3)))[:, None]
+    poses[:, :3, 3] = parts.get("TRANSLATION", 0.0)
+    return poses
 
 
 def _kind(about: dict[str, Any]) -> np.dtype[Any]:
