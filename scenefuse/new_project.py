@@ -4,6 +4,7 @@ import re
 import shlex
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import permutations
 from pathlib import Path
 from typing import Literal
 
@@ -94,6 +95,10 @@ def project_rows(folder: Path, scene: Path | None, objects: Sequence[Path]) -> d
         raise StageError(f"two objects would be called '{twice}'; rename one of their folders or files")
     if scene is not None and scene.resolve() in (path.resolve() for path in objects):
         raise StageError(f"{scene} is given as the scene and as an object; give the object's own photos")
+    folders = [path.resolve() for path in (scene, *objects) if path is not None and path.is_dir()]
+    for inner, outer in permutations(folders, 2):
+        if inner.is_relative_to(outer):
+            raise StageError(f"{inner} lies in {outer}, whose photos in folders below count too; move it elsewhere")
     scene_name = "" if scene is None else default_name(scene)
     scenes = [] if scene is None else [{"scene": scene_name} | _source(scene, folder, video=False)]
     rows = [

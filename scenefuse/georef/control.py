@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -18,7 +19,7 @@ from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3, along_a_line
 from scenefuse.marks.clicks import Click, in_photos
 from scenefuse.marks.triangulation import MAX_CLICK_MISS, intersect, model_pixel, read_ends
 from scenefuse.photos.photos import Photo
-from scenefuse.photos.positions import cells_of
+from scenefuse.photos.positions import cells_of, exif_number
 from scenefuse.photos.workspace import images_by_name
 
 if TYPE_CHECKING:
@@ -112,19 +113,12 @@ def _row(cells: list[str], where: str) -> tuple[str, Row]:
     except (ValueError, IndexError):
         raise StageError(f"{where}: expected {LAYOUT}, got '{' '.join(cells)}'{comma_advice(cells[:5])}") from None
     name = cells[6] if len(cells) > 6 and cells[6] else f"{cells[0]} {cells[1]} {cells[2]}"
-    stated = [number for cell in cells[7:9] if (number := _number(cell)) is not None]
-    if any(sd <= 0 for sd in stated):
-        raise StageError(f"{where}: a standard deviation (columns 8 and 9, metres) has to be positive")
+    stated = [exif_number(cell) or 0.0 for cell in cells[7:9] if re.match(r"[-+.]*\d", cell)]
+    if min(stated, default=1.0) <= 0:
+        advice = comma_advice(cells[7:9])
+        raise StageError(f"{where}: a standard deviation (columns 8 and 9, metres) has to be a positive number{advice}")
     sd_m = (stated[0], stated[-1]) if stated else SD_M
     return name, (numbers[:3], sd_m, photo, numbers[3:])
-
-
-def _number(cell: str) -> float | None:
-    try:
-        number = float(cell)
-    except ValueError:
-        return None
-    return number if np.isfinite(number) else None
 
 
 def _point(name: str, rows: list[Row], position: Array, path: Path) -> SurveyedPoint:

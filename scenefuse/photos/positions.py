@@ -23,15 +23,15 @@ def _xmp(names: str, value: str) -> re.Pattern[bytes]:
 
 
 # Standard deviations in metres: DJI's, then Pix4D's (Parrot, senseFly, ...).
-EAST, NORTH, UP = (_xmp(f"drone-dji:RtkStd{name}", r"[-+\d.eE]+") for name in ("Lon", "Lat", "Hgt"))
-HORIZONTAL, VERTICAL = (_xmp(f"Camera:GPS{name}Accuracy", r"[-+\d.eE]+") for name in ("XY", "Z"))
+EAST, NORTH, UP = (_xmp(f"drone-dji:RtkStd{name}", r"[-+\d.eE/]+") for name in ("Lon", "Lat", "Hgt"))
+HORIZONTAL, VERTICAL = (_xmp(f"Camera:GPS{name}Accuracy", r"[-+\d.eE/]+") for name in ("XY", "Z"))
 # Positions; DJI spells longitude in two ways.
 LATITUDE = _xmp("drone-dji:(?:Gps)?Latitude|exif:GPSLatitude", "[^\"'<]{1,60}")
 LONGITUDE = _xmp("drone-dji:(?:Gps)?Longt?itude|exif:GPSLongitude", "[^\"'<]{1,60}")
 ALTITUDE = _xmp("drone-dji:AbsoluteAltitude|exif:GPSAltitude", "[^\"'<]{1,60}")
 BELOW = _xmp("exif:GPSAltitudeRef", r"\d")
 # A number in text, perhaps a fraction.
-NUMBER = re.compile(r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)(?:\s*/\s*(\d+(?:\.\d*)?))?")
+NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?:\s*/\s*(\d+(?:\.\d*)?))?")
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def _first(pattern: re.Pattern[bytes], xmp: bytes) -> bytes | None:
 
 def _positive(pattern: re.Pattern[bytes], xmp: bytes) -> float | None:
     """A positive number in XMP, or None."""
-    number = exif_number((_first(pattern, xmp) or b"").decode("latin-1"))
+    number = next(iter(_parts(_first(pattern, xmp) or b"")), None)
     return number if number is not None and number > 0 else None
 
 

@@ -148,12 +148,14 @@ def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
     Path("filmed/clip.MP4").touch()
     Path("notes.txt").write_text("Flight of 12 May\nwindy\n")
     Project(two_folders).photos("one", 1)
+    Project(two_folders).photos("flight/shed", 4)
     for folder, sentence in (
         ("empty", "the photo folder empty holds no photos"),
         ("filmed", r"filmed holds no photos; .*\(as an object, give the video itself: filmed/clip.MP4\)"),
         ("notes.txt", r"notes.txt is not a readable TXT cloud \(none of its first lines holds three numbers"),
         ("one", "one holds 1 photo; cameras need three or more"),
         ("flight", "flight is given as the scene and as an object"),
+        ("flight/shed", "flight/shed lies in .*flight, whose photos in folders below count too; move it elsewhere"),
     ):
         with pytest.raises(StageError, match=sentence):
             run(folder)

@@ -238,6 +238,9 @@ def test_feet_stay_feet_in_the_results(tmp_path, model):
         (lambda lines: [*lines[:3], *changed(lines[3:4], "a", 0, lambda x: x + 1)], "different coordinates"),
         (lambda lines: [line.replace(".jpg", "x.jpg") for line in lines], "none of the 24 photos"),
         (lambda lines: changed(lines, "b", 3, lambda x: x + 900), "lies outside"),
+        (lambda lines: [lines[0], lines[1] + "\t0,01"], "has to be a positive number; 0,01 has a decimal comma"),
+        (lambda lines: [lines[0], lines[1] + "\t10mm"], "a standard deviation .* has to be a positive number"),
+        (lambda lines: ["EPSG:3857", *lines[1:]], "WGS 84 / Pseudo-Mercator is Mercator's projection"),
         (lambda lines: [line for line in lines if line[-1] not in "abcd"], "2 control points with a height"),
         (lambda lines: lines[:1] + [lines[k] for k in range(1, len(lines), 5)], "clicked in"),
         (lambda lines: [swapped(line) for line in lines], "x and y are swapped"),
@@ -337,7 +340,7 @@ def listed(folder, tmp_path):
 def test_accuracies_are_read_from_xmp(tmp_path):
     folder = tmp_path / "flight"
     dji = b'<x drone-dji:RtkStdLon="0.012" drone-dji:RtkStdLat="0.016" drone-dji:RtkStdHgt="0.03"/>'
-    pix4d = b"<Camera:GPSXYAccuracy>0.05</Camera:GPSXYAccuracy><Camera:GPSZAccuracy>0.1</Camera:GPSZAccuracy>"
+    pix4d = b"<Camera:GPSXYAccuracy>5/100</Camera:GPSXYAccuracy><Camera:GPSZAccuracy>.1</Camera:GPSZAccuracy>"
     a_photo(folder, "a.jpg", dji)
     a_photo(folder, "b.jpg", pix4d, orientation=6)
     a_photo(folder, "c.jpg", b'<x drone-dji:RtkStdLon="0.0" drone-dji:RtkStdLat="0.0" drone-dji:RtkStdHgt="n/a"/>')

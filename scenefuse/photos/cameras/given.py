@@ -87,12 +87,18 @@ def colmap_camera(model: str, width: float, height: float, params: Sequence[floa
     camera = pycolmap.Camera(model=model, width=round(width), height=round(height), params=list(map(float, params)))
     if not camera.verify_params():
         raise ValueError(f"a camera has {len(params)} parameters, but {model} has {camera.params_info}")
-    if min(camera.params[k] for k in camera.focal_length_idxs()) <= 0:
-        raise ValueError("a focal length has to be positive")
+    # A hundredth of the width sees 179 degrees.
+    if 100 * (focal := min(camera.params[k] for k in camera.focal_length_idxs())) < max(width, height):
+        raise ValueError(f"a focal length is {focal:g}; it counts in pixels, of which there are {width:g} x {height:g}")
     middle = camera.principal_point_x, camera.principal_point_y
     if not (0 < middle[0] < width and 0 < middle[1] < height):
         raise ValueError(f"a principal point, {middle}, lies outside its {width:g} x {height:g} pixels")
     return camera
+
+
+def seen_from(turn: Array, shift: Array) -> Array:
+    """(4, 4) object_from_cam of a rotation (3, 3) and a translation (3,) into the camera."""
+    return np.vstack([np.column_stack([turn.T, -turn.T @ shift]), [0, 0, 0, 1]])
 
 
 def at_size(camera: pycolmap.Camera, size: Size, where: str) -> pycolmap.Camera:

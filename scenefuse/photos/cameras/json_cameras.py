@@ -14,7 +14,7 @@ from scenefuse.cloud.crs import plane, read_crs
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines, read_text
 from scenefuse.core.transforms import Sim3
-from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, check_crs, colmap_camera
+from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, check_crs, colmap_camera, seen_from
 from scenefuse.photos.photo_files import COORDS, HELD_OUT_FILE, files_by_name, stored_size
 
 TRANSFORMS = {"transforms.json": "nerfstudio", "transforms_train.json": "Blender"}
@@ -181,9 +181,6 @@ def _lens(entry: dict[str, Any], where: str) -> Camera:
     return _bent(LENSES[kind], (width, height), [*focal, *middle], entry)
 
 
-def _shot_pose(shot: dict[str, Any]) -> np.ndarray:
+def _shot_pose(shot: dict[str, Any]) -> NDArray[np.float64]:
     """(4, 4) world_from_cam."""
-    cam_from_world = np.eye(4)
-    cam_from_world[:3, :3] = Rotation.from_rotvec(shot["rotation"]).as_matrix()
-    cam_from_world[:3, 3] = shot["translation"]
-    return np.asarray(np.linalg.inv(cam_from_world))
+    return seen_from(Rotation.from_rotvec(shot["rotation"]).as_matrix(), np.array(shot["translation"], np.float64))

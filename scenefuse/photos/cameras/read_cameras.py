@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines, read_text
 from scenefuse.core.transforms import Array
-from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, PosedPhoto, colmap_camera, largest
+from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, PosedPhoto, colmap_camera, largest, seen_from
 from scenefuse.photos.cameras.json_cameras import TRANSFORMS, opensfm_place, read_opensfm, read_transforms
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
 from scenefuse.photos.photo_files import (
@@ -30,6 +30,7 @@ from scenefuse.photos.photo_files import (
     head,
     stored_size,
 )
+from scenefuse.photos.positions import exif_number
 
 Found = TypeVar("Found")
 LAYOUTS = (
@@ -207,8 +208,7 @@ def _read_bundler(file: Path) -> list[GivenCamera]:
         raise StageError(f"{file} has {len(cameras)} cameras, its list names {len(names)} photos; export both again")
     for name, ((focal, *bent), turn, shift) in zip(names, cameras):
         if focal > 0:
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = (FLIP @ turn).T, -turn.T @ shift
+            pose = seen_from(FLIP @ turn, FLIP @ shift)
             found.append(GivenCamera(name, partial(_bundler_camera, focal, *bent), pose))
     return found
 
@@ -243,9 +243,8 @@ def read_colmap(model: Path) -> list[GivenCamera]:
     images = _binary_images(model / "images.bin") if binary else _text_images(model / "images.txt")
     found = []
     for name, camera, (*turn, x, y, z) in images:
-        pose, rotation = np.eye(4), Rotation.from_quat(turn, scalar_first=True).as_matrix().T
-        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ [x, y, z]
-        found.append(GivenCamera(name, cameras[camera], pose))
+        rotation = Rotation.from_quat(turn, scalar_first=True).as_matrix()
+        found.append(GivenCamera(name, cameras[camera], seen_from(rotation, np.array([x, y, z]))))
     return found
 
 
@@ -269,7 +268,9 @@ def _text_images(file: Path) -> list[Image]:
         words = line.split(maxsplit=9)
         if line.startswith("#"):
             continue
-        if after_image and (not words or _are_observations(line.split())):
+        cells = line.split()
+        # Observations are x y point, again and again; no photo's name ends in a number.
+        if after_image and (not cells or (len(cells) % 3 == 0 and exif_number(cells[-1]) is not None)):
             after_image = False
         elif words:
             if len(words) < 10:
@@ -277,14 +278,6 @@ def _text_images(file: Path) -> list[Image]:
             found.append((words[9].strip(), int(words[8]), [float(word) for word in words[1:8]]))
             after_image = True
     return found
-
-
-def _are_observations(words: list[str]) -> bool:
-    """Whether a line is x y point, again and again."""
-    try:
-        return len([float(word) for word in words]) % 3 == 0
-    except ValueError:
-        return False
 
 
 def _binary_cameras(file: Path) -> dict[int, pycolmap.Camera]:
