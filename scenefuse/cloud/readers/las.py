@@ -1,6 +1,5 @@
 """LAS and LAZ read: points, what the format says of them, and the coordinate system."""
 
-import io
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
@@ -91,8 +90,7 @@ def _packed(path: Path, header: Any) -> int:
     """How many points the chunks of a LAZ hold at least; 0 where it has no table of chunks."""
     import lazrs
 
-    record = header.vlrs.get("LasZipVlr")[0].record_data
-    laszip = lazrs.LazVlr(record)
+    laszip = lazrs.LazVlr(header.vlrs.get("LasZipVlr")[0].record_data)
     with open(path, "rb") as file, suppress(lazrs.LazrsError):
         file.seek(header.offset_to_point_data)
         chunks = lazrs.read_chunk_table(file, laszip)
@@ -102,16 +100,6 @@ def _packed(path: Path, header: Any) -> int:
             if header.point_format.id >= 6:  # behind its first point, a chunk says how many it has
                 file.seek(sum(size for _, size in chunks[:-1]) + laszip.item_size(), 1)
                 counts[-1] = int.from_bytes(file.read(4), "little")
-            elif 0 < (rest := header.point_count - sum(counts[:-1])) <= laszip.chunk_size():
-                # Packed again, the points that are counted are as long as the chunk.
-                points, again = bytearray(rest * laszip.item_size()), io.BytesIO()
-                file.seek(header.offset_to_point_data)
-                reader, writer = lazrs.LasZipDecompressor(file, record), lazrs.LasZipCompressor(again, laszip)
-                reader.seek(header.point_count - rest)
-                reader.decompress_many(points)
-                writer.compress_many(points)
-                writer.done()
-                counts[-1] = rest + (chunks[-1][1] > again.tell())
         return sum(counts)
     return 0
 
