@@ -141,8 +141,8 @@ def similarity_rows(lever: Array, direction: Array) -> Array:
 
     `lever` (..., 3) is from the centre to the points.
     """
-    along = (lever * direction).sum(-1, keepdims=True)
-    return np.concatenate([np.cross(lever, direction), direction, along], axis=-1)
+    (x, y, z), (u, v, w) = np.moveaxis(lever, -1, 0), np.moveaxis(direction, -1, 0)
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u, u, v, w, x * u + y * v + z * w], axis=-1)
 
 
 def moved_about(
