@@ -276,6 +276,64 @@ def _insert(score, best):
         best[x] = better
 
 
+# Loops are written out: expressions of whole arrays take Numba twice as long to compile.
+@njit
+def _score_tile(inverse, windows, weights, photos, sizes, turns, moves, keep, taps, result, top, bottom, left):
+    """`score_on_cpu` of the tile of the rows from `top` to before `bottom` that begins at column `left`."""
+    count, height, width = inverse.shape
+    window, radius, rows = len(taps), len(taps) // 2, bottom - top
+    right = min(left + TILE - window + 1, width)
+    # With the halo, as far as the photo goes; columns and rows of buffers begin at the halo's.
+    above, below = max(top - radius, 0), min(bottom + radius, height)
+    before, behind = max(left - radius, 0), min(right + radius, width)
+    lead, reach, halo = before - left + radius, behind - before, rows + 2 * radius
+    along, down = np.zeros((halo, window * TILE), np.float32), np.zeros((rows, window * TILE), np.float32)
+    reference, inside = np.zeros((halo, TILE), np.float32), np.zeros((halo, TILE), np.float32)
+    # Without it, sums of squares are small and exact.
+    middle = windows[1, top, left]
+    for y in range(above, below):
+        for x in range(before, behind):
+            reference[y - top + radius, x - left + radius] = windows[0, y, x] - middle
+        for k in range(window):
+            along[y - top + radius, k * TILE : k * TILE + right - left] = weights[0, y, k, left:right]
+            if top <= y < bottom:
+                down[y - top, k * TILE : k * TILE + right - left] = weights[1, y, k, left:right]
+    place, score = np.zeros(reach, np.int32), np.zeros(right - left, np.float32)
+    part_x, part_y, value = np.zeros(reach, np.float32), np.zeros(reach, np.float32), np.zeros(TILE, np.float32)
+    mean = np.zeros((rows, right - left), np.float32)
+    for k in range(rows):
+        for x in range(right - left):
+            mean[k, x] = windows[1, top + k, left + x] - middle
+    sums = np.zeros(halo * 3 * TILE, np.float32)
+    best = np.zeros((keep, rows, right - left), np.float32)
+    for d in range(count):
+        best[:] = np.float32(OUTSIDE_SCORE)
+        start = 0
+        for s in range(len(sizes)):
+            high, wide = sizes[s, 0], sizes[s, 1]
+            photo = photos[start : start + high * wide]
+            start += high * wide
+            for y in range(above, below):
+                k = y - top + radius
+                _place(
+                    inverse[d, y, before:behind], turns[s], moves[s], before, y, wide, high, place, part_x, part_y,
+                    inside[k, lead:],
+                )  # fmt: skip
+                _warp(photo, np.uint32(wide), place, part_x, part_y, middle, value[lead:])
+                _sums_along(value, reference[k], along[k], taps, right - left, sums[k * 3 * TILE :])
+            for k in range(rows):
+                variance, seen = windows[2, top + k, left:right], inside[k + radius, radius:]
+                _correlate(sums[k * 3 * TILE :], down[k], taps, mean[k], variance, seen, score)
+                for j in range(keep):
+                    _insert(score, best[j, k])
+        for k in range(rows):
+            for x in range(right - left):
+                total = np.float32(0.0)
+                for j in range(keep):
+                    total += best[j, k, x]
+                result[d, top + k, left + x] = total / np.float32(keep)
+
+
 @njit(parallel=True, cache=True)
 def score_on_cpu(inverse, windows, weights, photos, sizes, turns, moves, keep, taps, result):  # type: ignore[no-untyped-def]
     """Mean NCC of the best `keep` sources for D hypotheses per pixel, into result (D, h, w).
@@ -285,53 +343,9 @@ def score_on_cpu(inverse, windows, weights, photos, sizes, turns, moves, keep, t
     H * W,) of S sources, one behind the other, of heights and widths sizes (S, 2) int64; turns (S, 3, 3) and moves
     (S, 3) give places in -1..1; taps: a tuple as long as the window, by which the compiler knows its length.
     """
-    count, height, width = inverse.shape
-    window = len(taps)
-    radius, rows, columns = window // 2, 32, TILE - window + 1
+    (height, width), rows, columns = inverse.shape[1:], 32, TILE - len(taps) + 1
     across = (width + columns - 1) // columns
     for tile in prange(across * ((height + rows - 1) // rows)):
         top, left = tile // across * rows, tile % across * columns
-        bottom, right = min(top + rows, height), min(left + columns, width)
-        # The same with the halo, as far as the photo goes; columns and rows of buffers begin at the halo's.
-        above, below = max(top - radius, 0), min(bottom + radius, height)
-        before, behind = max(left - radius, 0), min(right + radius, width)
-        lead, reach = before - left + radius, behind - before
-        along, down = (
-            np.zeros((rows + 2 * radius, window * TILE), np.float32),
-            np.zeros((rows, window * TILE), np.float32),
-        )
-        reference = np.zeros((rows + 2 * radius, TILE), np.float32)
-        inside = np.zeros((rows + 2 * radius, TILE), np.float32)
-        # Without it, sums of squares are small and exact.
-        middle = windows[1, top, left]
-        for y in range(above, below):
-            reference[y - top + radius, lead : lead + reach] = windows[0, y, before:behind] - middle
-            for k in range(window):
-                along[y - top + radius, k * TILE : k * TILE + right - left] = weights[0, y, k, left:right]
-                if top <= y < bottom:
-                    down[y - top, k * TILE : k * TILE + right - left] = weights[1, y, k, left:right]
-        place, score = np.zeros(reach, np.int32), np.zeros(right - left, np.float32)
-        part_x, part_y, value = np.zeros(reach, np.float32), np.zeros(reach, np.float32), np.zeros(TILE, np.float32)
-        sums = np.zeros((rows + 2 * radius) * 3 * TILE, np.float32)
-        best = np.zeros((keep, rows, right - left), np.float32)
-        for d in range(count):
-            best[:] = np.float32(OUTSIDE_SCORE)
-            start = 0
-            for s in range(len(sizes)):
-                high, wide = sizes[s, 0], sizes[s, 1]
-                photo = photos[start : start + high * wide]
-                start += high * wide
-                for y in range(above, below):
-                    k = y - top + radius
-                    _place(
-                        inverse[d, y, before:behind], turns[s], moves[s], before, y, wide, high, place, part_x, part_y,
-                        inside[k, lead:],
-                    )  # fmt: skip
-                    _warp(photo, np.uint32(wide), place, part_x, part_y, middle, value[lead:])
-                    _sums_along(value, reference[k], along[k], taps, right - left, sums[k * 3 * TILE :])
-                for k in range(bottom - top):
-                    mean, variance = windows[1, top + k, left:right] - middle, windows[2, top + k, left:right]
-                    _correlate(sums[k * 3 * TILE :], down[k], taps, mean, variance, inside[k + radius, radius:], score)
-                    for j in range(keep):
-                        _insert(score, best[j, k])
-            result[d, top:bottom, left:right] = best.sum(0)[: bottom - top] / np.float32(keep)
+        bottom = min(top + rows, height)
+        _score_tile(inverse, windows, weights, photos, sizes, turns, moves, keep, taps, result, top, bottom, left)
