@@ -11,7 +11,7 @@ demo: .venv/ready
 
 # Unit tests that start no process, but few slow ones; those of one package and what imports it: make check PART=masks.
 check: .venv/tests
-	pytest -n $(CORES) --dist loadfile -m "not process and not slow" $(if $(PART),--part $(PART)) tests/unit
+	pytest -n $(CORES) --dist loadfile --serial-kernels -m "not process and not slow" $(if $(PART),--part $(PART)) tests/unit
 
 # Every path that a GPU takes beside its twin on the CPU, on a machine with PyTorch's CUDA build; gpu.py says what else.
 check-gpu:

@@ -1,4 +1,5 @@
-"""Options of the test run: `--part masks` selects the files of tests that reach a part of the library."""
+"""Options of the test run: `--part masks` selects the files of tests that reach a part of the library, and
+`--serial-kernels` compiles Numba's kernels for one thread, which takes half as long."""
 
 import os
 from collections.abc import Iterator
@@ -29,6 +30,17 @@ settings.load_profile("few")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--part", help="only tests that reach this package of the library, as fingerprints of jobs do")
+    parser.addoption("--serial-kernels", action="store_true", help="Numba compiles no parallel loops")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Numba does not tell kernels for one thread from the others in its cache; they have another."""
+    if config.getoption("--serial-kernels"):
+        import numba
+
+        numba.config.CACHE_DIR = str(Path(numba.config.CACHE_DIR or config.rootpath / ".pytest_cache") / "serial")
+        njit = numba.njit
+        numba.njit = lambda *function, parallel=False, **options: njit(*function, **options)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
