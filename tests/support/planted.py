@@ -143,18 +143,9 @@ def _paint(name, points, normals):
         return np.clip((0.5 + 0.2 * np.sin(3 * points[:, 2]))[:, None] * [1.0, 0.8, 0.6], 0, 1)
     if name == "balloon":
         panel = np.floor((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * 8).astype(int) % 8
-        palette = np.array(
-            [
-                [0.8, 0.15, 0.1],
-                [0.95, 0.8, 0.1],
-                [0.1, 0.3, 0.75],
-                [0.9, 0.9, 0.88],
-                [0.8, 0.15, 0.1],
-                [0.15, 0.55, 0.25],
-                [0.95, 0.8, 0.1],
-                [0.45, 0.15, 0.5],
-            ]
-        )
+        red, yellow, blue, white = [0.8, 0.15, 0.1], [0.95, 0.8, 0.1], [0.1, 0.3, 0.75], [0.9, 0.9, 0.88]
+        green, violet = [0.15, 0.55, 0.25], [0.45, 0.15, 0.5]
+        palette = np.array([red, yellow, blue, white, red, green, yellow, violet])
         base = np.where((points[:, 2] > 4)[:, None], palette[panel], [0.45, 0.3, 0.15])
     else:
         base = np.where((normals[:, 2] > 0.3)[:, None], [0.6, 0.28, 0.2], [0.78, 0.72, 0.6])
@@ -167,6 +158,14 @@ def _mesh(part):
     mesh.vertex.positions = o3d.core.Tensor.from_numpy(part.vertices.astype(np.float32))
     mesh.triangle.indices = o3d.core.Tensor.from_numpy(part.triangles.astype(np.int32))
     return mesh
+
+
+def sampled(parts, count, seed, noise):
+    """A noisy cloud on the surfaces of parts, without colours."""
+    o3d.utility.random.seed(seed)
+    found = _mesh(join(parts)).to_legacy().sample_points_uniformly(count, use_triangle_normal=True)
+    points = np.asarray(found.points) + np.random.default_rng(seed).normal(0, noise, (count, 3))
+    return Cloud(points, np.asarray(found.normals).astype(np.float32))
 
 
 def _seen_by(rays, points, camera):

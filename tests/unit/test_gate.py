@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from support.planted import errors, plant
 
-from scenefuse.cloud.clouds import Cloud
+from scenefuse.cloud.clouds import Cloud, concatenate
 from scenefuse.core.transforms import Sim3, Uncertainty
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import Surface
@@ -280,7 +280,7 @@ def test_a_pose_is_refused_where_the_objects_own_model_may_be_bent_beyond_use():
 
 # Less work than by default: only the decision counts here.
 COARSE = replace(CoarseSettings(), ransac_samples=5000, feature_scale_steps=1, scale_steps=5, candidates=6, keep=3)
-FINE = replace(SETTINGS, voxel_fraction=0.02, turn_steps=8)
+FINE = replace(SETTINGS, voxel_fraction=0.02, turn_steps=2)
 
 
 @pytest.fixture(scope="module")
@@ -366,14 +366,8 @@ def test_surfaces_that_lie_behind_each_other_are_displaced_and_those_that_meet_a
 
 
 def test_an_object_with_a_copy_beside_it_is_refused(house):
-    scene, aside = house.scene, np.array([0.9 * house.diagonal, 0, 0])
-    both = Cloud(
-        np.concatenate([scene.points, scene.points + aside]),
-        np.concatenate([scene.normals] * 2),
-        np.concatenate([scene.colors] * 2),
-    )
-    truth = house.scene_from_object
-    starts = [(truth, "one"), (shift(*aside) @ truth, "other")]
+    scene, aside, truth = house.scene, shift(0.9 * house.diagonal, 0, 0), house.scene_from_object
+    starts, both = [(truth, "one"), (aside @ truth, "other")], concatenate([scene, scene.transformed(aside)])
     decision = registered(house.object, both, house.up_in_object, starts).decision
     assert not decision.registered
     assert registered(house.object, scene, house.up_in_object, starts[:1]).decision.registered

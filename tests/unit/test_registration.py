@@ -39,8 +39,9 @@ COARSE, FINE = CoarseSettings(), FineSettings()
 # Little work, where only the course of the computation matters.
 LITTLE = (
     replace(COARSE, ransac_samples=5000, feature_scale_steps=1, scale_steps=3, yaw_steps=8, candidates=4, keep=2),
-    replace(FINE, turn_steps=6, voxel_fraction=0.02),
+    replace(FINE, turn_steps=2, voxel_fraction=0.02),
 )
+UNTURNED = replace(LITTLE[1], turn_steps=1)
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +49,8 @@ def house():
     return plant("house", 5, ground=False, noise=0.005, object_points=3000, density_ratio=1.0)
 
 
-def refined(trial, start, *, evidence=None, settings=LITTLE[1]):
-    """The outcome of the fine registration of a trial from one pose."""
+def refined(trial, start, *, evidence=None, settings=UNTURNED):
+    """The outcome of the fine registration of a trial from one pose, by default without turned copies of it."""
     scales = ScaleRange(trial.scene_from_object.scale, 0.3)
     problem = Problem(trial.object, trial.scene, scales, evidence or Constraints())
     return refine_hypotheses(problem, [(start, "planted")], settings)
@@ -58,11 +59,11 @@ def refined(trial, start, *, evidence=None, settings=LITTLE[1]):
 @pytest.fixture(scope="module")
 def by_clouds(house):
     """The house by its clouds alone, from the true pose."""
-    return refined(house, house.scene_from_object)
+    return refined(house, house.scene_from_object, settings=LITTLE[1])
 
 
 def test_a_planted_pose_is_found_and_accepted():
-    trial = plant("balloon", 5, ground=False, noise=0.005, object_points=4000, density_ratio=1.0)
+    trial = plant("balloon", 5, ground=False, noise=0.005, object_points=2000, density_ratio=1.0)
     ups = (trial.up_in_object, Z)
     scales = prior(estimates(trial.object, trial.scene, ups), ScaleSettings())
     problem = Problem(trial.object, trial.scene, scales, Constraints(ups, trial.free_space))
@@ -272,14 +273,14 @@ def test_frame_ledger_chains_its_transforms(tmp_path):
 def test_a_scale_at_the_edge_of_its_prior_is_refused(house):
     truth = house.scene_from_object
     scales = ScaleRange(truth.scale * np.exp(-0.3), 0.1)
-    settings = replace(LITTLE[1], turn_steps=2, min_f_score=0.0)
+    settings = replace(UNTURNED, min_f_score=0.0)
     problem = Problem(house.object, house.scene, scales)
-    assert not refine_hypotheses(problem, [(truth, "planted")], settings).decision.registered
+    assert "at the edge" in refine_hypotheses(problem, [(truth, "planted")], settings).decision.reason
 
 
 def test_a_balloon_without_colours_has_a_free_axis_and_is_no_rival_to_itself():
     def egg(seed):
-        points = np.random.default_rng(seed).normal(size=(4000, 3))
+        points = np.random.default_rng(seed).normal(size=(2000, 3))
         return Cloud(points / np.linalg.norm(points, axis=1, keepdims=True) * [1, 1, 1.6])
 
     turned = Sim3(1.0, Rotation.from_euler("z", 70, degrees=True).as_matrix(), np.zeros(3))
@@ -362,7 +363,7 @@ def test_photos_overrule_geometry_and_clouds_do_not_carry_their_pose_off(house):
     half_turn, middle = np.diag([-1.0, -1.0, 1.0]), truth.apply(centre)
     turned = Sim3(1.0, half_turn, middle - half_turn @ middle) @ truth
     evidence = Constraints((house.up_in_object, Z), None, shared(truth))
-    outcome = refined(house, turned, evidence=evidence, settings=replace(LITTLE[1], turn_steps=1))
+    outcome = refined(house, turned, evidence=evidence)
     assert outcome.decision.registered and outcome.decision.decided_by == "photos"
     scale, angle, shift = errors(outcome.ranked[0].pose, truth, centre, house.diagonal)
     assert abs(scale) < 2 and angle < 2 and shift < 0.01

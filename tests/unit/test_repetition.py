@@ -4,11 +4,10 @@ steps it is shifted."""
 from dataclasses import replace
 
 import numpy as np
-import open3d as o3d
 import pytest
-from support.planted import errors
+from support.planted import errors, sampled
 
-from demo.objects import box, join, sheet
+from demo.objects import box, sheet
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3, Uncertainty
 from scenefuse.geometry.icp import ScaleRange
@@ -21,18 +20,7 @@ from scenefuse.register.repetition import shifts_onto_itself
 STEP, BAY = np.array([0.3, 0.0, 0.17]), np.array([2.0, 0.0, 0.0])
 NOTHING, NARROW = Constraints(), ScaleRange(1.0, 0.1)
 # Coarser than by default, for speed.
-FINE = replace(FineSettings(), voxel_fraction=0.016, turn_steps=4)
-
-
-def sampled(parts, count, seed):
-    """A noisy cloud on a mesh of parts."""
-    surface = join(parts)
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(surface.vertices), o3d.utility.Vector3iVector(surface.triangles)
-    )
-    o3d.utility.random.seed(seed)
-    points = np.asarray(mesh.sample_points_uniformly(count).points)
-    return points + np.random.default_rng(seed).normal(0, 0.004, points.shape)
+FINE = replace(FineSettings(), voxel_fraction=0.016, turn_steps=2)
 
 
 def stairs(seed):
@@ -42,7 +30,7 @@ def stairs(seed):
         x, z = k * STEP[0], k * STEP[2]
         parts += [sheet((x, 0, z), (x + 0.3, 0, z), (x + 0.3, 2, z), (x, 2, z), 0)]
         parts += [sheet((x, 0, z - 0.17), (x, 2, z - 0.17), (x, 2, z), (x, 0, z), 0)]
-    return sampled(parts, 20000, seed)
+    return sampled(parts, 10000, seed, 0.004).points
 
 
 def row(bays, seed):
@@ -50,7 +38,7 @@ def row(bays, seed):
     length = 2.0 * bays
     parts = [box((0, 0, -0.3), (length, 1.4, 0), 0), box((0, 0.2, 3), (length, 1.2, 3.6), 0)]
     parts += [box((2 * k + 0.7, 0.4, 0), (2 * k + 1.3, 1.0, 3), 0) for k in range(bays)]
-    return sampled([*parts, box((-0.4, 0, -0.3), (0, 1.4, 4.2), 0)], 1000 * bays, seed)
+    return sampled([*parts, box((-0.4, 0, -0.3), (0, 1.4, 4.2), 0)], 600 * bays, seed, 0.004).points
 
 
 def between(points, low, high):
@@ -80,7 +68,7 @@ def test_a_wall_that_slides_along_itself_and_a_box_do_not_repeat():
     wall = [box((0, 0, 0), (8, 0.2, 3), 0)]
     hut = [box((0, 0, 0), (5, 3, 3), 0), box((1, -0.2, 1), (2, 0, 2), 0), box((3, -0.2, 1), (4, 0, 2), 0)]
     for parts in (wall, hut):
-        assert shifts_onto_itself(prepare(Cloud(sampled(parts, 20000, 0)), 0.06, 0, 12000), 0.06) == []
+        assert shifts_onto_itself(prepare(sampled(parts, 20000, 0, 0.004), 0.06, 0, 12000), 0.06) == []
 
 
 def test_stairs_one_step_off_are_refused_where_the_scene_shows_some_of_their_steps():

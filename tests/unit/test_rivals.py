@@ -3,13 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-import open3d as o3d
 import pytest
 from scipy.spatial.transform import Rotation
-from support.planted import errors
+from support.planted import errors, sampled
 
-from demo.objects import box, join, sheet
-from scenefuse.cloud.clouds import Cloud
+from demo.objects import box, sheet
 from scenefuse.core.transforms import Sim3
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings
@@ -33,14 +31,7 @@ def hut(canopy, seed):
             sheet((5 * s, -3.5, 0), (5 * s, 3.5, 0), (5 * s, 3.5, 3.5), (5 * s, -3.5, 3.5), 0),
             sheet((-5, 3.5 * s, 3.5), (5, 3.5 * s, 3.5), (5, 0, 6.5), (-5, 0, 6.5), 0),
         ]
-    surface = join(parts)
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(surface.vertices), o3d.utility.Vector3iVector(surface.triangles)
-    )
-    o3d.utility.random.seed(seed)
-    sampled = mesh.sample_points_uniformly(6000, use_triangle_normal=True)
-    noise = np.random.default_rng(seed).normal(0, 0.05, (6000, 3))
-    return Cloud(np.asarray(sampled.points) + noise, np.asarray(sampled.normals).astype(np.float32))
+    return sampled(parts, 6000, seed, 0.05)
 
 
 def register(obj, scene):

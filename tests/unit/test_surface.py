@@ -596,14 +596,9 @@ def test_paper_begins_with_an_overview_and_gives_an_object_two_pages_with_its_si
     assert "from the north" in pages[2] and "1.00 scene units" in pages[2] and "1:" not in pages[2]
 
 
-def test_four_sides_on_paper_are_to_the_round_scale_that_is_written_below(coarse, tmp_path: Path):
-    write_surface(tmp_path / "surface.ply", coarse)
-    write_glb(tmp_path / "surface.glb", coarse, {})
-    write_json(tmp_path / "georeference.json", GEOREFERENCE)
-    files = {"surface": tmp_path / "surface.ply", "glb": tmp_path / "surface.glb"}
-    draw_surface(
-        name="shed", folder=tmp_path / "shed/drawings", georeference_json=tmp_path / "georeference.json", **files
-    )
+def test_four_sides_on_paper_are_to_the_round_scale_that_is_written_below(placed, tmp_path: Path):
+    (tmp_path / "shed").mkdir()
+    (tmp_path / "shed/drawings").symlink_to(placed)
     (tmp_path / "objects.tsv").write_text("object\tstatus\nshed\tregistered\n")
     write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")
     page = pypdfium2.PdfDocument(tmp_path / "r.pdf")[2]
