@@ -1,6 +1,7 @@
 """Point clouds in memory: any known format in, PLY with float64 positions out (LAS: write_las)."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -266,14 +267,15 @@ def cloud_of(columns: Columns, white: float | None = None) -> Cloud:
     )
 
 
-def write_cloud(path: Path, cloud: Cloud) -> None:
+def write_cloud(path: Path, cloud: Cloud, comments: Sequence[str] = ()) -> None:
     """Write a binary PLY atomically: positions as float64, normals float32, colours uint8, fields as they are.
 
-    Fields are `scalar_NAME` in it. PLY allows no spaces in a name: they become underscores.
+    Fields are `scalar_NAME` in it. PLY allows no spaces in a name: they become underscores. Comments are lines of its
+    header.
     """
     vertex = records_of(cloud, path)
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
-        file.write(header_of([Element("vertex", len(vertex), vertex.dtype)]))
+        file.write(header_of([Element("vertex", len(vertex), vertex.dtype)], comments))
         file.write(vertex.tobytes())
 
 

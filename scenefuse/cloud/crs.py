@@ -133,6 +133,15 @@ def has_place(crs: str | None) -> bool:
     return crs is not None and not plane(pyproj.CRS.from_user_input(crs)).is_engineering
 
 
+def crs_name(crs: str) -> str:
+    """The name of a coordinate system, with its code."""
+    try:
+        name = pyproj.CRS.from_user_input(crs).name
+    except pyproj.exceptions.CRSError:
+        return crs
+    return f"{name} ({crs})" if len(crs) < len(name) else name
+
+
 def plane(crs: pyproj.CRS) -> pyproj.CRS:
     """The horizontal part of a CRS."""
     return crs.sub_crs_list[0] if crs.is_compound else crs

@@ -7,7 +7,7 @@ its name. Memory does not grow with the scene.
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -212,7 +212,9 @@ def write_tiled(path: Path, parts: Parts, count: int, sample: Array) -> None:
 
 
 @contextmanager
-def reserved(path: Path, row: np.dtype[Any], count: int, tiles: int = 0) -> Iterator[tuple[BinaryIO, int]]:
+def reserved(
+    path: Path, row: np.dtype[Any], count: int, tiles: int = 0, comments: Sequence[str] = ()
+) -> Iterator[tuple[BinaryIO, int]]:
     """A PLY of so many points and tiles with its header written and its space reserved, and where its points begin.
 
     Without tiles it is a PLY like any other.
@@ -223,7 +225,7 @@ def reserved(path: Path, row: np.dtype[Any], count: int, tiles: int = 0) -> Iter
         StageError: the disk has too little space.
     """
     elements = [Element("vertex", count, row), Element("tile", tiles, ROW_OF_TILE)]
-    header = header_of(elements if tiles else elements[:1])
+    header = header_of(elements if tiles else elements[:1], comments)
     size = len(header) + count * row.itemsize + tiles * ROW_OF_TILE.itemsize
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         file.write(header)

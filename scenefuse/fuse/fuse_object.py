@@ -24,7 +24,7 @@ from scenefuse.fuse.modes import (
 from scenefuse.fuse.surroundings import ground_to_add, reach_of
 from scenefuse.fuse.write import Source, as_bytes, frame_ledger, together, with_source
 from scenefuse.geometry.photo_check import Photos, moved_photos, pack, read_photos
-from scenefuse.photos.geodesy import length_unit
+from scenefuse.photos.geodesy import frame_notes, length_unit
 from scenefuse.photos.workspace import read_workspace
 from scenefuse.register.uncertainty import Uncertainty
 
@@ -101,7 +101,7 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
     notes += of_colors
     for note in notes:
         print(note, flush=True)
-    _write(fused, rows, crop_json, outputs)
+    _write(fused, rows, crop_json, outputs, frame_notes(inputs.georeference_json))
     unit = length_unit(inputs.georeference_json)
     write_json(outputs.evidence, evidence_report(fused, checked))
     content = _report(fused, checked, registration, len(whole), unit) | {
@@ -193,13 +193,13 @@ def photos_of(workspace: Path | None, points: Array, frame: Sim3 | None = None) 
     return moved_photos(photos, frame) if frame else photos
 
 
-def _write(fused: Fused, rows: Rows, crop_json: dict[str, Any], outputs: FusionOutputs) -> None:
+def _write(fused: Fused, rows: Rows, crop_json: dict[str, Any], outputs: FusionOutputs, comments: list[str]) -> None:
     """The clouds; rows: (N,) of the part of the scene in its cloud."""
     kept, added = with_source(fused.kept, Source.SCENE), with_source(fused.added, Source.OBJECT)
-    write_cloud(outputs.fused, together(_in_box(kept, crop_json), added))
+    write_cloud(outputs.fused, together(_in_box(kept, crop_json), added), comments)
     checked = fused.scene[fused.rows]
     checked.fields["row"], checked.fields["reason"] = rows[fused.rows].astype(np.uint32), fused.reason
-    write_cloud(outputs.checked, checked)
+    write_cloud(outputs.checked, checked, comments)
 
 
 def _report(

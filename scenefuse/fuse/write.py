@@ -5,7 +5,7 @@ A scene is never copied for an object: its changes name the rows of the scene's 
 that is read.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from itertools import chain
@@ -26,7 +26,7 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.core.version import VERSION
 from scenefuse.fuse.compare import Reason
 from scenefuse.fuse.measure import FIELDS, Evidence, unchecked
-from scenefuse.photos.geodesy import scene_frame
+from scenefuse.photos.geodesy import frame_notes, scene_frame
 
 # Least and largest gain of an object's colours, and pairs of points that it is computed from at least.
 GAINS, MIN_PAIRS = (0.5, 2.0), 50
@@ -147,6 +147,7 @@ def write_completed(
     added: list[Cloud],
     count: int,
     tiles: NDArray[Any],
+    comments: Sequence[str] = (),
 ) -> None:
     """Write a completed scene as PLY, part by part: what the changes leave of the scene, then what comes in.
 
@@ -158,10 +159,11 @@ def write_completed(
         added: clouds with the fields of evidence and `source`.
         count: points that are left and come in.
         tiles: (T,) ROW_OF_TILE, a row for each tile, for the file's end; none for a file that is not read in tiles.
+        comments: of the header.
     """
     columns = changes.left_of(np.zeros(0, np.int64), like)
     columns = replace(columns, fields=dict(sorted(columns.fields.items())))
-    with reserved(path, records_of(columns, path).dtype, count, len(tiles)) as (file, _):
+    with reserved(path, records_of(columns, path).dtype, count, len(tiles), comments) as (file, _):
         for cloud in chain((changes.left_of(*part) for part in parts), added):
             file.write(records_of(_with_columns_of(columns, cloud), path).tobytes())
         file.write(tiles.tobytes())
@@ -322,7 +324,7 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_copc:
         if len(cloud):
             print(f"{inputs.objects[cloud.fields['source'][0] - 1].name}: {len(cloud)} points", flush=True)
     frame = None if inputs.georeference_json is None else scene_frame(read_json(inputs.georeference_json))
-    counts = _write(scene, merged(changes), added, completed)
+    counts = _write(scene, merged(changes), added, completed, frame_notes(inputs.georeference_json))
     if frame is None:
         write_copc(completed_copc, open_cloud(completed), lambda points: points, None)
     else:
@@ -334,7 +336,9 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_copc:
     write_json(report, content)
 
 
-def _write(scene: TiledCloud, changes: Changes, added: list[Cloud], path: Path) -> dict[int, int]:
+def _write(
+    scene: TiledCloud, changes: Changes, added: list[Cloud], path: Path, comments: Sequence[str]
+) -> dict[int, int]:
     """Write the completed scene: the scene's tiles in their order, then a tile for what each object adds.
 
     Returns the number of points of each `source`.
@@ -349,7 +353,7 @@ def _write(scene: TiledCloud, changes: Changes, added: list[Cloud], path: Path) 
     tiles["count"] = [*left[left > 0], *map(len, added)]
     for name, values in zip(BOX, boxes.T):
         tiles[name] = values
-    write_completed(path, scene.like, scene.parts(), changes, added, int(tiles["count"].sum()), tiles)
+    write_completed(path, scene.like, scene.parts(), changes, added, int(tiles["count"].sum()), tiles, comments)
     return {0: int(left.sum())} | {int(cloud.fields["source"][0]): len(cloud) for cloud in added}
 
 

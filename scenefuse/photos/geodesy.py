@@ -9,7 +9,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from scenefuse.cloud.crs import unit_m
+from scenefuse.cloud.crs import crs_name, unit_m
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Sim3, fit_sim3
 
@@ -162,3 +162,36 @@ def scene_frame(georeference: Mapping[str, Any]) -> LocalFrame | GridFrame | Non
 def length_unit(georeference: Path | None) -> str:
     """The unit of lengths in a scene's frame by its `georeference.json`: "m", or (without that file) "scene units"."""
     return "scene units" if georeference is None else str(value(read_json(georeference), "length_unit"))
+
+
+def frame_notes(georeference: Path | None) -> list[str]:
+    """What the coordinates of a scene's files are, for headers in ASCII: unit, origin, CRS, heights."""
+    known = {} if georeference is None else {name: entry["value"] for name, entry in read_json(georeference).items()}
+    unit, crs = known.get("length_unit", "scene units"), known.get("crs")
+    notes = [f"x y z: {'metres' if unit == 'm' else unit}"]
+    if "origin_in_crs" not in known:
+        notes[0] += " in a local frame"
+    else:
+        notes[0] += " east, north, up of" if "origin_latitude_deg" in known else ", less"
+        place = "{:.12g} {:.12g} {:.12g}".format(*known["origin_in_crs"])
+        notes[0] += f" {place} in {crs_name(crs) if crs else 'the coordinates of the given cloud'}"
+    if crs and "origin_latitude_deg" in known:
+        notes += [f"heights: {heights_of(crs, known.get('control_points'), known.get('origin_altitude_m'))}"]
+    return [" ".join(note.encode("ascii", "replace").decode().split()) for note in notes]
+
+
+def heights_of(crs: str | None, control_points: int | None, altitude_m: float | None) -> str:
+    """From where heights of a scene with photos are counted.
+
+    Args:
+        crs: of the scene.
+        control_points: how many place it.
+        altitude_m: of its origin; None where no position has a height.
+    """
+    if altitude_m is None:
+        return "relative to the middle camera: no position has a height"
+    if crs is not None and (whole := pyproj.CRS.from_user_input(crs)).is_compound:
+        return whole.sub_crs_list[1].name
+    if control_points:
+        return "those of the control points"
+    return "as the photos' GPS gives them (EXIF), which does not say whether above the ellipsoid or the sea"

@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 from PIL.ExifTags import IFD, Base
 
+from scenefuse.cloud.crs import crs_name
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.version import VERSION
+from scenefuse.photos.geodesy import heights_of
 from scenefuse.photos.photo_files import open_picture
 from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.report.run_summary import ALONE, ObjectSummary
@@ -61,12 +63,13 @@ def object_facts(row: Row) -> dict[str, str]:
         absolute = "; that is relative: on Earth it is known as well as the scene (see Position)"
         facts["Accuracy"] = found[0] + (absolute if "crs" in has else "")
     if "scale_sd_log" in has:
-        ends = ", plus the deviation of both ends" if has.get("scene_scale_sd_log") else ", beside the scene's"
-        facts["Lengths"] = _of_lengths(scale_sd(row), unit) + ends
+        facts["Scale"] = _trust(scale_sd(row), unit) + ("" if has.get("scene_scale_sd_log") else ", beside the scene's")
     if "registered" in has and "frames" in has:
         facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used"
         facts["Photos"] += f", taken {has['photographed']}" if "photographed" in has else ""
     folder = f"results/objects/{has['object']}"
+    if has.get("added_points") and "removed_points" in has:
+        facts["Points"] = f"{has['added_points']:,.0f} added, {has['removed_points']:,.0f} of the scene's removed"
     if "added_points" in has:
         facts["File"] = f"{folder}/fused.ply with its surroundings (local frame, {_plural(unit)})"
     elif status == ALONE:
@@ -85,10 +88,26 @@ def _plural(unit: str) -> str:
     return "metres" if unit == "m" else unit
 
 
-def _of_lengths(scale_sd: float, unit: str) -> str:
-    """How well lengths are known whose scale has this relative standard deviation."""
-    ten = f", {length(10 * scale_sd, 'm')} in 10 m (standard deviation)" if unit == "m" else ""
-    return f"known to {percent(scale_sd)}{ten}"
+def _trust(scale_sd: float, unit: str) -> str:
+    """How far lengths can be trusted whose scale has this relative standard deviation."""
+    ten = f", {length(10 * scale_sd, 'm')} on a 10 m wall" if unit == "m" else ""
+    return f"trust it to {percent(scale_sd)}{ten} (standard deviation)"
+
+
+def _scale(has: dict[str, Any]) -> str:
+    """Whether a scene's lengths can be trusted, and what gives them."""
+    if has.get("length_unit", "scene units") == "scene units":
+        return "do not trust it: nothing gives it, and lengths are in scene units"
+    if has.get("control_points"):
+        return f"trust it as far as the {has['control_points']:.0f} control points that give it (see Position)"
+    if "gps_scale_sd_log" in has:
+        return f"{_trust(has['gps_scale_sd_log'], has['length_unit'])}, by the photos' GPS"
+    if has.get("lengths", 0) > 1:
+        return (
+            f"trust it to {percent(has['length_rms_pct'] / 100)}, by which {has['lengths']:.0f} known lengths disagree"
+        )
+    given = "one known length" if "lengths" in has else "the given cloud"
+    return f"it is that of {given}; nothing checks it"
 
 
 def is_current(made: Path, source: Path) -> bool:
@@ -155,6 +174,10 @@ def scene_facts(row: Row) -> dict[str, str]:
         facts["Result"] = f"no dense cloud: {has['error']}"
     elif "completed_points" in has:
         facts["Result"] = f"completed with {has['completed_by']}; {has['completed_points']:,.0f} points"
+        if "removed_points" in has and "points" in has:
+            added = has["completed_points"] - has["points"] + has["removed_points"]
+            facts["Result"] += f": {has['points']:,.0f} of the scene before, {added:,.0f} added, less "
+            facts["Result"] += f"{has['removed_points']:,.0f} that close-ups contradict or measured better"
     elif "points" in has:
         facts["Result"] = f"{has['points']:,.0f} points, not completed with all objects yet"
     photos = "given as a cloud"
@@ -162,18 +185,19 @@ def scene_facts(row: Row) -> dict[str, str]:
         photos = f"{has['registered']:.0f} of {has['photos']:.0f} photos used"
     facts["Photographed"] = ", ".join(filter(None, [has.get("photographed"), photos]))
     if unit == "m":
-        facts["Coordinates"] = f"metres, {_crs_name(has['crs'])}" if "crs" in has else "metres, in a local frame"
+        facts["Coordinates"] = f"metres, {crs_name(has['crs'])}" if "crs" in has else "metres, in a local frame"
     else:
-        facts["Coordinates"] = "scene units: neither GPS, control points nor known lengths give metres"
+        facts["Coordinates"] = f"{unit}, in a local frame"
     if "latitude_deg" in has:
         north, east = has["latitude_deg"], has["longitude_deg"]
         place = f"{abs(north):.5f}° {'NS'[north < 0]}, {abs(east):.5f}° {'EW'[east < 0]}"
-        above = f", {has['altitude_m']:,.1f} m high as the positions count it" if "altitude_m" in has else ""
+        above = f", {has['altitude_m']:,.1f} m high" if "altitude_m" in has else ""
+        facts["Heights"] = heights_of(has.get("crs"), has.get("control_points"), has.get("altitude_m"))
         facts["Place"] = f"{place}{above}; from there the local frame counts metres east, north and up"
     if found := accuracies(row):
         facts["Position"] = f"absolute, where on Earth the scene lies: {found[0]}"
-    if "gps_scale_sd_log" in has:
-        facts["Lengths"] = f"{_of_lengths(has['gps_scale_sd_log'], unit)}, by the photos' GPS"
+    if "length_unit" in has:
+        facts["Scale"] = _scale(has)
     if "ground_pixel" in has:
         facts["Ground pixel"] = f"{length(has['ground_pixel'], unit)}, what a pixel of a photo covers on the ground"
     if "completed_points" in has:
@@ -209,7 +233,13 @@ def made_by(summary: Path) -> str:
     file = summary / "scenes.tsv"
     day = date.fromtimestamp(file.stat().st_mtime) if file.is_file() else date.today()
     who = dict.fromkeys(filter(None, (_known(row).get("made_by") for row in records(read_table(file)))))
-    return f"Made with scenefuse {VERSION}{' by ' if who else ''}{', '.join(who)} on {day}."
+    by = f" by {', '.join(who)}" if who else ", by whom is not stated (made_by in config/scenes.tsv)"
+    return f"Made with scenefuse {VERSION} on {day}{by}."
+
+
+def title_of(objects: Sequence[Path]) -> str:
+    """The project's folder and what was completed in it."""
+    return ": ".join(filter(None, [Path.cwd().name, named([folder.name for folder in objects])]))
 
 
 def closing_lines(summary: Path) -> str:
@@ -293,17 +323,6 @@ def ground_pixel(folder: Path) -> float | None:
 def _known(row: Row) -> dict[str, Any]:
     """The cells that hold something."""
     return {name: cell for name, cell in row.items() if cell == cell and cell not in (None, "", "-")}
-
-
-def _crs_name(crs: str) -> str:
-    """The name of a coordinate system, with its code."""
-    import pyproj
-
-    try:
-        name = pyproj.CRS.from_user_input(crs).name
-    except pyproj.exceptions.CRSError:
-        return crs
-    return f"{name} ({crs})" if len(crs) < len(name) else name
 
 
 def diagnose(item: ObjectSummary) -> list[str]:

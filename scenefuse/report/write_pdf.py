@@ -12,7 +12,7 @@ from PIL import Image
 
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.version import VERSION
-from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scene_facts, surface_facts
+from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scene_facts, surface_facts, title_of
 from scenefuse.report.values import WORDS, length
 from scenefuse.surface.gltf import metres_per_unit
 
@@ -29,12 +29,12 @@ def write_pdf(
         summary: folder with the summary's TSV files.
         scenes: result folders of the scenes.
         objects: result folders of the objects; drawings/ and figures/ in them are shown where they are.
-        title: of the project; the working directory's name where it is left out.
+        title: of the project; that of `title_of` where it is left out.
         report: output PDF.
     """
     rows = rows_of(summary, "object", objects)
     facts = [object_facts(row) | surface_facts(folder, row) for folder, row in zip(objects, rows)]
-    page = _Page(title or Path.cwd().name, made_by(summary))
+    page = _Page(title or title_of(objects), made_by(summary))
     page.start(page.project, f"{page.made} The files that are named here lie in the project's folder.")
     for row in rows_of(summary, "scene", scenes):
         page.text_line(f"Scene {row['scene']}", 12)

@@ -11,7 +11,7 @@ import pandas as pd
 import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scale_sd, scene_facts, surface_facts
+from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scale_sd, scene_facts, surface_facts, title_of
 from scenefuse.report.page import document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
 from scenefuse.report.values import WORDS, asset, number, read_table
@@ -44,7 +44,7 @@ def write_report(
         scenes: result folders of the scenes; scene.png and the 3D view in it are shown.
         objects: result folders of the objects; masks.png and figures/ in it are shown.
         paper: section that compares the run with the paper, HTML, which only recipe `paper` has; it may be missing.
-        title: heading of the page; the working directory's name where it is left out.
+        title: heading of the page; that of `title_of` where it is left out.
         report: output, one HTML file.
 
     Raises:
@@ -53,7 +53,7 @@ def write_report(
     if not (summary / "summary.txt").is_file():
         raise StageError(f"{summary / 'summary.txt'} does not exist; write the summary first")
     texts: Texts = yaml.safe_load(asset("report.yaml"))
-    title, papers = title or Path.cwd().name, [] if paper is None else [paper]
+    title, papers = title or title_of(objects), [] if paper is None else [paper]
     views = _views([*(folder / "figures" for folder in objects), *scenes])
     tables = {name: table for name in texts["tables"] if len(table := read_table(summary / f"{name}.tsv"))}
     shown = list(zip(objects, rows_of(summary, "object", objects)))

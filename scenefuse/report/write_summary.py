@@ -217,7 +217,7 @@ def summary_text(run: RunSummary, tables: dict[str, pd.DataFrame], made: str) ->
     if run.failed:
         lines += ["", "jobs that failed", *(line for job in run.failed for line in _line("", job))]
     more = "details.txt says what the stages measured and chose; report.html shows it all."
-    return "\n".join([*lines, "", f"{_count(run.objects, run.variants[0])}. {made}", more]) + "\n"
+    return "\n".join([*lines, "", f"{_count(run.objects, run.variants[0])}.", *textwrap.wrap(made, WIDTH), more]) + "\n"
 
 
 def _fact_lines(facts: dict[str, str], most: int | None = None) -> list[str]:
@@ -251,9 +251,19 @@ def _heading(text: str) -> list[str]:
 
 
 def _line(label: str, text: str, most: int | None = None) -> list[str]:
-    """`label   text`, wrapped, continuation lines indented; `most` is how many lines there may be."""
-    wrapper = textwrap.TextWrapper(WIDTH, f"{label:<13} ", " " * 14, max_lines=most, placeholder=" ... (details.txt)")
-    return wrapper.wrap(text.replace("\n", ". "))
+    """`label   text`, wrapped, continuation lines indented; `most` is how many a line of the text may take."""
+    lines = list[str]()
+    for part in text.splitlines():
+        start = f"{'' if lines else label:<13} "
+        lines += textwrap.wrap(
+            part,
+            WIDTH,
+            initial_indent=start,
+            subsequent_indent=" " * 14,
+            max_lines=most,
+            placeholder=" ... (details.txt)",
+        )
+    return lines
 
 
 def _pairs(*cells: Cell) -> str:
@@ -275,6 +285,10 @@ def _count(objects: list[ObjectSummary], variant: str) -> str:
     return "; ".join(parts) + unchecked
 
 
+def _in_words(key: str) -> str:
+    return key.replace(".", " ").replace("_", " ")
+
+
 def _detail_lines(details: dict[str, dict[str, str]], fields: Fields) -> list[str]:
     """The lines of what there is, and every choice, fallback, warning and note that a stage recorded."""
     lines = list[str]()
@@ -283,8 +297,9 @@ def _detail_lines(details: dict[str, dict[str, str]], fields: Fields) -> list[st
         cells = [(name, plain(find(fields, *key)), unit_of(fields, *key) or "") for name, key in keys.items()]
         lines += _line(label, _pairs(*cells))
     chosen = {k: i["value"] for k, i in fields.items() if k.rsplit(".", 1)[-1] in CHOICES and k.count(".") == 1}
-    lines += _line("chosen", "; ".join(f"{k} {number(plain(v))}" for k, v in chosen.items() if v not in (None, "")))
+    said = (f"{_in_words(k)} {number(plain(v))}" for k, v in chosen.items() if v not in (None, ""))
+    lines += _line("chosen", "; ".join(said))
     for key, item in fields.items():
         if NOTES.search(key) and key not in REASONS and item["value"] not in (None, "", [], {}, False):
-            lines += _line("note", f"{key}: {plain(item['value'])}")
+            lines += _line("note", f"{_in_words(key)}: {plain(item['value'])}")
     return lines

@@ -1,5 +1,6 @@
 """The stage that makes the surface of one completed object."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, t
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS, MAX_PHOTOS
 from scenefuse.geometry.photo_check import moved_view, read_photos, showing
-from scenefuse.photos.geodesy import length_unit
+from scenefuse.photos.geodesy import frame_notes, length_unit
 from scenefuse.photos.workspace import View, Workspace, read_views
 from scenefuse.surface.gltf import metres_per_unit, place_of_scene, write_glb
 from scenefuse.surface.mesh import FaceClass, Surface, make_mesh
@@ -56,7 +57,7 @@ def make_surface(*, inputs: SurfaceInputs, surface: Path, glb: Path, report: Pat
     except StageError as error:
         print(f"no surface: {error}", flush=True)
         found, reason = _nothing(), str(error)
-    write_surface(surface, found)
+    write_surface(surface, found, frame_notes(inputs.georeference_json))
     painted, why = paint(found, views)
     unit, place = length_unit(inputs.georeference_json), place_of_scene(inputs.georeference_json)
     if painted is None:
@@ -142,8 +143,8 @@ def surface_report(surface: Surface, unit: str) -> dict[str, Any]:
     }
 
 
-def write_surface(path: Path, surface: Surface) -> None:
-    """Write a binary PLY mesh."""
+def write_surface(path: Path, surface: Surface, comments: Sequence[str] = ()) -> None:
+    """Write a binary PLY mesh, with these lines in its header."""
     records = records_of(surface.vertices, path)
     records.dtype.names = tuple(map(in_file, records.dtype.names or ()))
     layout = [("vertex_indices", "<i4", (3,)), ("class", "u1")]
@@ -151,7 +152,7 @@ def write_surface(path: Path, surface: Surface) -> None:
     faces["corners"], faces["vertex_indices"], faces["class"] = 3, surface.faces, surface.classes
     # plyfile writes lists one by one, in seconds: it only describes them.
     described = PlyElement.describe(records, "vertex"), PlyElement.describe(np.empty(len(faces), layout), "face")
-    header = PlyData(described, byte_order="<").header
+    header = PlyData(described, byte_order="<", comments=comments).header
     with atomic_file(path) as temporary:
         temporary.write_bytes(f"{header}\n".encode() + records.tobytes() + faces.tobytes())
 

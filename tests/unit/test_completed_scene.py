@@ -27,7 +27,7 @@ def strip(low, high, y=0.0, color=(200, 100, 50)):
     return Cloud(points, normals, (np.array(color) * (0.6 + 0.4 * np.sin(points[:, :1]))).astype(np.uint8))
 
 
-def run(folder, scene, objects, mode="fill", refused=(), failed=()):
+def run(folder, scene, objects, mode="fill", refused=(), failed=(), georeference=None):
     """Each object fused, then the stage, on objects given in the scene's frame; each one's crop is the scene itself."""
     write_cloud(folder / "scene.ply", scene)
     write_json(
@@ -51,6 +51,7 @@ def run(folder, scene, objects, mode="fill", refused=(), failed=()):
                 crop=folder / "scene.ply",
                 crop_json=folder / "crop.json",
                 fine_json=mine / "fine.json",
+                georeference_json=georeference,
             ),
             outputs=FusionOutputs(
                 fused=mine / "fused.ply",
@@ -66,6 +67,7 @@ def run(folder, scene, objects, mode="fill", refused=(), failed=()):
             objects=[folder / name for name in (*objects, *(f for f in failed if f not in objects))],
             failed=tuple(failed),
             jobs=JobRecords(folder / "logs", folder / "benchmarks"),
+            georeference_json=georeference,
         ),
         completed=folder / "completed.ply",
         completed_copc=folder / "completed.copc.laz",
@@ -85,6 +87,27 @@ def test_objects_apart_add_what_each_adds_alone(tmp_path):
         assert len(mine) == value(report, "added_points")[name] > 100
         assert np.allclose(mine.points, alone.points)
         assert np.abs(mine.colors.astype(int) - alone.colors).max() <= 1
+
+
+def test_headers_of_the_clouds_name_their_frame_and_readers_pass_over_that(tmp_path):
+    known = {"origin_latitude_deg": 47.5, "origin_longitude_deg": 9.0, "origin_altitude_m": 470.0, "length_unit": "m"}
+    known |= {"crs": "EPSG:25832+7837", "origin_in_crs": [5e5, 5260875.25, 470.0], "crs_from_scene": np.eye(4)}
+    write_json(tmp_path / "georeference.json", {name: quantity(item, "") for name, item in known.items()})
+    objects = {"left": strip(0.03, 3, 1.54)}
+    (tmp_path / "plain").mkdir()
+    plain, _ = run(tmp_path / "plain", strip(0, 20), objects)
+    whole, _ = run(tmp_path, strip(0, 20), objects, georeference=tmp_path / "georeference.json")
+    assert np.array_equal(whole.points, plain.points) and whole.fields.keys() == plain.fields.keys()
+    for name in ("completed.ply", "left/fused.ply", "left/checked.ply"):
+        header = (tmp_path / name).read_bytes().split(b"end_header")[0].decode("ascii").splitlines()
+        assert header[2:4] == [
+            "comment x y z: metres east, north, up of 500000 5260875.25 470 in ETRS89 / UTM zone 32N + DHHN2016 height"
+            " (EPSG:25832+7837)",
+            "comment heights: DHHN2016 height",
+        ]
+        assert "comment x y z: scene units in a local frame" in (tmp_path / "plain" / name).read_bytes().decode(
+            "latin1"
+        )
 
 
 def test_what_two_objects_share_is_added_once(tmp_path):

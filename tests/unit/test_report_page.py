@@ -339,13 +339,14 @@ QUESTIONS = {
     "how exact?": r"12\.9 mm in the scene, the standard deviation of a point",
     "what is missing?": r"2\.0 % is missing: 0\.9 % seen by no photo",
     "which CRS?": r"UTM zone 32N \(EPSG:25832\)",
+    "which heights?": r"which does not say whether above the ellipsoid or the sea",
     "when?": "2024-06-01",
     "when were the close-ups taken?": "taken 2024-06-02",
     "how many photos?": "40 of 40 used",
-    "may I trust the scale?": r"known to 0\.2 %, 22\.4 mm in 10 m",
+    "may I trust the scale?": r"trust it to 0\.2 %, 22\.4 mm on a 10 m wall",
     "where is the file?": r"objects/\s*house/\s*fused\.ply",
     "what next?": "photograph it from 4 places",
-    "who made it?": r"Made with scenefuse \d.* by Hof Müller on 20\d\d-",
+    "who made it?": r"Made with scenefuse \d.* on 20\d\d-\S+ by Hof Müller",
     "which frame?": r"with its surroundings \(local frame, metres\)",
     "what is that beside the GPS?": r"relative: on Earth it is known as well as the scene",
 }
@@ -368,6 +369,7 @@ def test_a_clients_questions_are_answered_by_the_first_screens(tmp_path, phone, 
     page = report(tmp_path, {"house": None})
     rows = {
         "scenes": "scene=yard length_unit=m points=900 completed_points=1000 completed_by=house crs=EPSG:25832"
+        " latitude_deg=47.5 longitude_deg=9.1 altitude_m=470"
         " photographed=2024-06-01 photos=60 registered=60 gps_scale_sd_log=0.002 made_by=Hof_Müller",
         "objects": "object=house scene=yard status=registered unit=m length=11.4 width=10.1 height=7.85"
         " surface_missing=0.02 surface_never_seen=0.009 deviation=0.00692 world_deviation=0.0129"

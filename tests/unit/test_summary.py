@@ -13,7 +13,7 @@ from PIL import Image
 
 from scenefuse.core.job_records import KILLED, NO_LOG, NOT_ACCEPTED, JobRecords, why_ended, why_unfinished
 from scenefuse.core.stage import StageError, quantity, write_json
-from scenefuse.report.facts import closing_lines
+from scenefuse.report.facts import closing_lines, scene_facts, title_of
 from scenefuse.report.run_summary import RunInputs
 from scenefuse.report.values import find, flatten, length, load, number, percent, percents
 from scenefuse.report.write_report import write_report
@@ -172,11 +172,11 @@ def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results)
     assert max(len(line) for line in text.splitlines()) <= 100
     assert "object house: registered" in text and "object balloon: unregistered" in text
     assert "Result        Not finished: no <mask> matches a frame [masks/sculpture.log]" in text
-    assert "dense.fallback: CPU used" in text
+    assert "dense fallback: CPU used" in text
     words = " ".join(text.split())
     assert "added 30 points, removed from the scene 16 points, of the object unconfirmed 7" in words
     assert "photos see a surface behind it 4" in words and "the object measured it better 12 points" in words
-    assert "fusion.notes: judged by the scene's photos" in words and "evidence.notes" not in words
+    assert "fusion notes: judged by the scene's photos" in words and "evidence notes" not in words
     assert "1 of 3 objects registered" in text
 
 
@@ -200,13 +200,18 @@ def test_the_text_says_that_ground_was_left_in(results):
     crop = {"diagonal": quantity(15.0, "m"), "notes": quantity([note], "")}
     write_json(results / "objects/house/registration/full/crop.json", crop)
     text = (summarise(results) / "details.txt").read_text()
-    assert f"crop.notes: {note}" in " ".join(text.split())
+    assert f"crop notes: {note}" in " ".join(text.split())
 
 
 def test_the_text_says_what_psnr_was_measured_on_and_what_the_completed_scene_holds(results):
     text = " ".join((summarise(results, ["house", "balloon"]) / "details.txt").read_text().split())
     assert "PSNR 27.5 dB, measured on training photos" in text and "held-out" not in text
     assert "Completed with house; 5,030 points" in text
+    completed = {"points": quantity(5030, "points"), "removed_points": quantity(20, "points")}
+    completed |= {"added_points": quantity({"house": 50}, "points")}
+    write_json(results / "scenes/demo/completed.json", completed)
+    counts = " ".join((summarise(results, ["house", "balloon"]) / "summary.txt").read_text().split())
+    assert "5,030 points: 5,000 of the scene before, 50 added, less 20 that close-ups contradict or" in counts
     assert "results/scenes/demo/completed.copc.laz, results/scenes/demo/completed.ply" in text
     assert "completed.copc" not in (summarise(results) / "details.txt").read_text()
 
@@ -539,12 +544,32 @@ def test_an_object_says_when_it_was_photographed_and_how_its_lengths_follow_from
     write_json(scene / "georeference.json", here)
     text = (summarise(results, made_by=("Hof Müller",)) / "summary.txt").read_text()
     assert re.search(r"Photos +39 of 40 used, taken 2024-06-02 to 2024-06-03\n", text)
-    assert re.search(r"Lengths +Known to 0\.5 %, 50\.0 mm in 10 m \(standard deviation\), plus", text)
-    assert re.search(r"Made with scenefuse [\d.]+ by Hof Müller on 20\d\d-\d\d-\d\d", text)
+    assert re.search(r"Scale +Trust it to 0\.5 %, 50\.0 mm on a 10 m wall \(standard deviation\)\n", text)
+    assert re.search(r"Scale +Trust it to 0\.4 %, 40\.0 mm on a 10 m wall .*, by the photos' GPS\n", text)
+    assert re.search(r"Made with scenefuse [\d.]+ on 20\d\d-\d\d-\d\d by Hof Müller", text)
     # Where control points hold the scene, its GPS does not say how well its lengths are known.
     write_json(scene / "georeference.json", here | {"control_points": quantity(5, "1")})
     text = (summarise(results) / "summary.txt").read_text()
-    assert re.search(r"Lengths +Known to 0\.3 %, 30\.0 mm in 10 m \(standard deviation\), beside the scene's\n", text)
+    assert re.search(
+        r"Scale +Trust it to 0\.3 %, 30\.0 mm on a 10 m wall \(standard deviation\), beside the scene's\n", text
+    )
+    assert "by whom is not stated (made_by in config/scenes.tsv)" in text
+
+
+@pytest.mark.parametrize(
+    ("known", "answer"),
+    [
+        ({}, "Do not trust it: nothing gives it, and lengths are in scene units"),
+        ({"length_unit": "m"}, "It is that of the given cloud; nothing checks it"),
+        ({"length_unit": "m", "lengths": 1}, "It is that of one known length; nothing checks it"),
+        ({"lengths": 3, "length_rms_pct": 0.4}, "Trust it to 0.4 %, by which 3 known lengths disagree"),
+        ({"control_points": 5, "gps_scale_sd_log": 0.02}, "Trust it as far as the 5 control points that give it"),
+        ({"gps_scale_sd_log": 0.02}, "Trust it to 2.0 %, 20.0 cm on a 10 m wall (standard deviation), by the photos'"),
+    ],
+)
+def test_whether_the_scale_can_be_trusted_has_one_answer(known, answer):
+    unit = known.get("length_unit", "m" if known else "scene units")
+    assert scene_facts({"scene": "demo", "length_unit": unit} | known)["Scale"].startswith(answer)
 
 
 def test_a_long_advice_is_cut_in_summary_and_whole_in_details(results):
@@ -557,6 +582,11 @@ def test_a_long_advice_is_cut_in_summary_and_whole_in_details(results):
     write_json(results / "objects/house/missing.json", {"stations": quantity(2, "")})
     first = "Next:   house: Photograph it from 2 places (results/objects/house/next_photos.csv) (1 more in the report)"
     assert closing_lines(summarise(results, ["house"])).splitlines()[-1] == first
+    # Each step is cut by itself.
+    blurred = {"blurred_photos": quantity({"blurred.jpg": 0.4}, "")}
+    write_json(results / "objects/house/stage2.json", blurred)
+    short = (summarise(results) / "summary.txt").read_text().split("object balloon")[0]
+    assert re.search(r"\n {14}Blurred photos \(1\): blurred.jpg;", short) and "(details.txt)\n" in short
     assert "photograph the steps between" in " ".join(long.split()) and "details.txt" not in long
 
 
@@ -566,6 +596,11 @@ def test_shares_and_lengths_are_written_as_people_do():
     ]
     lengths = [(0.0072, "m"), (0.256, "m"), (11.42, "m"), (0.5, "scene units"), (1234.5, "m")]
     assert [length(*given) for given in lengths] == ["7.20 mm", "25.6 cm", "11.4 m", "0.500 scene units", "1,234 m"]
+
+
+def test_a_project_is_called_by_its_folder_and_its_objects(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert title_of([tmp_path / "house", tmp_path / "shed"]) == f"{tmp_path.name}: house, shed"
 
 
 def test_a_page_without_a_summary_is_refused(tmp_path):

@@ -210,7 +210,8 @@ def test_points_in_a_line_have_no_surface_and_the_stage_says_so(tmp_path: Path):
 
 
 def test_a_written_surface_is_read_as_it_was(closed, tmp_path: Path):
-    write_surface(tmp_path / "surface.ply", closed)
+    write_surface(tmp_path / "surface.ply", closed, ["x y z: metres in a local frame"])
+    assert b"\ncomment x y z: metres in a local frame\n" in (tmp_path / "surface.ply").read_bytes()
     again = read_surface(tmp_path / "surface.ply")
     assert np.array_equal(again.faces, closed.faces) and np.array_equal(again.classes, closed.classes)
     assert np.array_equal(again.vertices.points, closed.vertices.points)

@@ -11,11 +11,11 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from support.surveyed import FRAME, fly, gcp_lines, write_inputs
 
-from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.georef.control import read_control
 from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.placement import GeoreferenceSettings
-from scenefuse.photos.geodesy import scene_frame
+from scenefuse.photos.geodesy import frame_notes, scene_frame
 from scenefuse.photos.photos import gps_accuracies, list_photos, read_photos
 from scenefuse.photos.positions import Position, positions_of, read_geo
 from scenefuse.sfm.mapping import in_metres
@@ -212,6 +212,40 @@ def test_heights_may_be_unknown_and_the_crs_may_have_a_vertical_part(tmp_path, m
     assert crs.is_compound and "DHHN2016" in crs.name
     place = scene_frame(report).in_crs(scene_frame(report).apply(FRAME.inverse(PLACES[:1])))[0]
     np.testing.assert_allclose(place, [float(c) for c in lines[1].split("\t")[:3]], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("known", "notes"),
+    [
+        ({}, ["x y z: scene units in a local frame"]),
+        ({"length_unit": "m"}, ["x y z: metres in a local frame"]),
+        (
+            {"length_unit": "m", "origin_in_crs": [4e5, 5e6, 0.5], "crs": None},
+            ["x y z: metres, less 400000 5000000 0.5 in the coordinates of the given cloud"],
+        ),
+        (
+            {"length_unit": "m", "origin_in_crs": [4e5, 5e6, 0.5], "crs": "EPSG:25832", "origin_latitude_deg": 47.5}
+            | {"origin_altitude_m": 470.0},
+            [
+                "x y z: metres east, north, up of 400000 5000000 0.5 in ETRS89 / UTM zone 32N (EPSG:25832)",
+                "heights: as the photos' GPS gives them (EXIF), which does not say whether above the ellipsoid or the"
+                " sea",
+            ],
+        ),
+    ],
+)
+def test_a_frame_is_described_in_a_line_or_two(tmp_path, known, notes):
+    write_json(tmp_path / "known.json", {name: quantity(item, "") for name, item in known.items()})
+    assert frame_notes(tmp_path / "known.json") == notes
+    for more, heights in (
+        ({"control_points": 4}, "heights: those of the control points"),
+        ({"crs": "EPSG:25832+7837"}, "heights: DHHN2016 height"),
+        ({"origin_altitude_m": None}, "heights: relative to the middle camera: no position has a height"),
+    ):
+        if len(notes) == 2:
+            content = {name: quantity(item, "") for name, item in (known | more).items()}
+            write_json(tmp_path / "known.json", content)
+            assert frame_notes(tmp_path / "known.json")[1] == heights
 
 
 def test_feet_stay_feet_in_the_results(tmp_path, model):

@@ -1,6 +1,6 @@
 """PLY: the header, which says where the columns lie, so that parts of them can be read; meshes and lists by plyfile."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -201,9 +201,9 @@ def _cells(element: Element, cells: list[bytes]) -> Iterator[Array]:
         at = end
 
 
-def header_of(elements: list[Element]) -> bytes:
-    """The header of a little-endian PLY with these elements."""
-    lines = ["ply", "format binary_little_endian 1.0"]
+def header_of(elements: list[Element], comments: Sequence[str] = ()) -> bytes:
+    """The header of a little-endian PLY with these elements, and lines that programs pass over."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     for element in elements:
         lines.append(f"element {element.name} {element.count}")
         assert element.row is not None and element.row.names is not None
