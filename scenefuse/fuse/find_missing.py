@@ -21,7 +21,7 @@ from scenefuse.fuse.modes import around
 from scenefuse.fuse.surroundings import missing_ground
 from scenefuse.fuse.write import added_by, read_changes, together
 from scenefuse.geometry.photo_check import Photos
-from scenefuse.photos.geodesy import GridFrame, LocalFrame, scene_frame
+from scenefuse.photos.geodesy import GridFrame, LocalFrame, compass, scene_frame
 from scenefuse.photos.workspace import View, with_mask
 
 POSITION = ("longitude_deg", "latitude_deg", "altitude_m")
@@ -101,7 +101,9 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     if "heights" in georeference and value(georeference, "heights") == "relative":
         gps_higher = np.nan
     unit = value(georeference, "length_unit")
-    rows = photo_rows(plan, cameras, scene_frame(georeference), gps_higher, unit)
+    # Stray points lie below an object's foot.
+    foot = float(np.percentile(obj.points[:, 2], 0.5))
+    rows = photo_rows(plan, foot, scene_frame(georeference), gps_higher, unit)
     _write_table(outputs.next_photos, rows)
     _write_geojson(outputs.geojson, rows)
     content = _report(missing, plan) | {
@@ -161,19 +163,18 @@ def _report(missing: Missing, plan: Plan) -> dict[str, Any]:
 
 
 def photo_rows(
-    plan: Plan, close_ups: list[View], frame: LocalFrame | GridFrame | None, gps_higher: float = 0.0, unit: str = "m"
+    plan: Plan, foot: float, frame: LocalFrame | GridFrame | None, gps_higher: float = 0.0, unit: str = "m"
 ) -> list[dict[str, Any]]:
     """A row for each photo; heading clockwise from north (from y without georeferencing), pitch above level.
 
     Args:
         plan: the stations.
-        close_ups: the object's photos.
+        foot: height of the object's lowest part.
         frame: where the scene lies; None where nothing says it.
         gps_higher: metres by which the flight's GPS counts heights higher than the scene; NaN where it counts none.
         unit: of the scene's lengths.
     """
-    rows, highest = [], max((float(view.centre[2]) for view in close_ups), default=0.0)
-    unit = unit.replace(" ", "_")
+    rows, unit = [], unit.replace(" ", "_")
     for number, station in enumerate(plan.stations, 1):
         for view in station.photos:
             ahead = view.cam_from_world[2, :3]
@@ -182,10 +183,12 @@ def photo_rows(
                 latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
                 row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
                 row |= {"altitude_m": round(altitude + gps_higher, 3)} if np.isfinite(gps_higher) else {}
-            row[f"above_highest_close_up_{unit}"] = float(f"{view.centre[2] - highest:.4g}")
+            row[f"above_foot_{unit}"] = float(f"{view.centre[2] - foot:.4g}")
             row["heading_deg"] = round(float(np.degrees(np.arctan2(ahead[0], ahead[1]))) % 360, 1)
+            row |= {} if frame is None else {"looking": compass(row["heading_deg"])}
             row["pitch_deg"] = round(float(np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))), 1)
-            row["shows_percent_of_missing"] = round(100 * station.shows, 1)
+            # Said once: the three photos show it together.
+            row["station_shows_percent_of_missing"] = round(100 * station.shows, 1) if view is station.photos[0] else ""
             rows.append(row | {f"local_{axis}_{unit}": float(f"{at:.7g}") for axis, at in zip("xyz", view.centre)})
     return rows
 

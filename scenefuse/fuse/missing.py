@@ -29,6 +29,8 @@ from scenefuse.photos.workspace import View
 # Directions that are tried, spread evenly over a sphere around the object, at these distances, in those of its
 # close-ups.
 DIRECTIONS, DISTANCES = 120, (0.7, 1.0, 1.4)
+# Places along a line of sight that are looked at for what stands in the way, as shares of it.
+STEPS = np.linspace(0, 1, 60)
 # Stations at most, and the share of what is missing that one must add.
 MAX_STATIONS, MIN_GAIN = 6, 0.05
 
@@ -286,6 +288,7 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
             break
         if not exact[best]:
             shown[best] &= _shown_in_all(photos[best], cells, obstacles, step, missing.side)
+            shown[best] &= free.sees(np.array([photo.centre for photo in photos[best]]), cells.points)
             exact[best] = True
             continue
         stations.append(Station(photos[best], float(gains[best]) / len(cells)))
@@ -319,6 +322,7 @@ class _Free:
     def __init__(self, obstacles: Array, middle: Array, reach: float, clearance: float):
         self.middle, self.reach, self.clearance = middle, reach, clearance
         self.obstacles, self.near, self.below = obstacles, cKDTree(obstacles), cKDTree(obstacles[:, :2])
+        self.beyond = cKDTree(obstacles[np.linalg.norm(obstacles - middle, axis=1) >= reach])
 
     def ways(self, eyes: Array) -> bool:
         """Whether all of (E, 3) places see the object over free space, up to what stands beside it."""
@@ -326,8 +330,16 @@ class _Free:
             return False
         ahead = self.middle - eyes
         ends = np.maximum(0, 1 - self.reach / np.linalg.norm(ahead, axis=1))
-        steps = np.linspace(0, 1, 60)[:, None, None] * ends[:, None]
+        steps = STEPS[:, None, None] * ends[:, None]
         return bool((self.near.query((eyes + steps * ahead).reshape(-1, 3))[0] > self.clearance).all())
+
+    def sees(self, eyes: Array, points: Array) -> NDArray[np.bool_]:
+        """(N,) whether nothing that does not stand beside the object is between any of (E, 3) places and a point."""
+        if not self.beyond.n:
+            return np.ones(len(points), dtype=bool)
+        places = eyes[:, None] + STEPS[:, None, None, None] * (points - eyes[:, None])
+        apart = self.beyond.query(places.reshape(-1, 3), distance_upper_bound=self.clearance / 2, workers=threads())[0]
+        return np.asarray(np.isinf(apart.reshape(-1, len(points))).all(0))
 
 
 def _photos_from(place: Array, middle: Array, lens: View) -> list[View]:

@@ -180,6 +180,12 @@ def frame_notes(georeference: Path | None) -> list[str]:
     return [" ".join(note.encode("ascii", "replace").decode().split()) for note in notes]
 
 
+def compass(heading_deg: float) -> str:
+    """The name of a direction clockwise from north."""
+    names = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
+    return names[round(heading_deg / 45) % len(names)]
+
+
 def heights_of(crs: str | None, control_points: int | None, altitude_m: float | None) -> str:
     """From where heights of a scene with photos are counted.
 

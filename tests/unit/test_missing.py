@@ -135,12 +135,32 @@ def test_no_station_lies_below_the_ground_or_in_a_wall(half):
     assert len(eyes) and (eyes[:, 2] > -RADIUS).all() and (eyes[:, 1] > -4.0).all()
 
 
+def test_what_a_wall_far_from_the_object_hides_is_not_shown_though_a_slit_shows_the_middle(half):
+    photos, masks, cloud = half
+    missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
+    slit, away = 0.45, 2.9
+    turn, z = (a.ravel() for a in np.meshgrid(np.linspace(0, 2 * np.pi, 240), np.arange(-6, 6, 0.08)))
+    around = np.stack([away * np.cos(turn), away * np.sin(turn), z], 1)[abs(z) > slit]
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(-9, 9, 0.1), np.arange(-9, 9, 0.1)))
+    ground = Cloud(CENTER + np.stack([x, y, np.full_like(x, -6.0)], 1), np.tile(np.float32([0, 0, 1]), (len(x), 1)))
+    wall = Cloud(CENTER + around, np.float32(-around / np.linalg.norm(around, axis=1)[:, None]))
+    stations = plan_stations(missing, cloud, concatenate([cloud, ground, wall]), photos.views).stations
+    for station in stations:
+        eye, cells = station.photos[1].centre - CENTER, missing.cells.points - CENTER
+        places = eye + np.linspace(0, 1, 400)[:, None, None] * (cells - eye)
+        inside = (np.linalg.norm(places[..., :2], axis=2) < away).argmax(0)
+        hidden = (inside > 0) & (abs(places[inside, np.arange(len(cells)), 2]) > slit)
+        facing = ((eye - cells) * missing.cells.normals).sum(1) > 0
+        assert station.shows <= (facing & ~hidden).mean()
+    assert stations
+
+
 def test_rows_say_where_to_stand_and_where_to_look(half):
     photos, masks, cloud = half
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
     plan = plan_stations(missing, cloud, cloud, photos.views)
     frame = LocalFrame(47.4, 8.5, 400.0)
-    rows = photo_rows(plan, photos.views, frame)
+    rows = photo_rows(plan, CENTER[2] - RADIUS, frame)
     assert len(rows) == 3 * len(plan.stations)
     for row in rows:
         eye = np.array([row[f"local_{axis}_m"] for axis in "xyz"])
@@ -149,15 +169,17 @@ def test_rows_say_where_to_stand_and_where_to_look(half):
         ahead, heading, pitch = CENTER - eye, np.radians(row["heading_deg"]), np.radians(row["pitch_deg"])
         looks = [np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)]
         assert looks @ ahead > 0.99 * np.linalg.norm(ahead)
-        highest = max(view.centre[2] for view in photos.views)
-        assert row["above_highest_close_up_m"] == pytest.approx(eye[2] - highest, abs=1e-3)
-    bare = photo_rows(plan, photos.views, None, unit="scene units")[0]
-    assert "longitude_deg" not in bare and bare["local_z_scene_units"] == rows[0]["local_z_m"]
-    assert sum(row["shows_percent_of_missing"] for row in rows[1::3]) == pytest.approx(
-        100 * sum(station.shows for station in plan.stations), abs=0.2
-    )
+        assert row["above_foot_m"] == pytest.approx(eye[2] - CENTER[2] + RADIUS, abs=1e-2)
+        for name, ahead in (("north", np.cos(heading)), ("east", np.sin(heading)), ("south", -np.cos(heading))):
+            assert (name in row["looking"]) == (ahead > np.sin(np.pi / 8))
+    bare = photo_rows(plan, 0.0, None, unit="scene units")[0]
+    assert "longitude_deg" not in bare and "looking" not in bare and bare["local_z_scene_units"] == rows[0]["local_z_m"]
+    # What a station shows is said once, of its three photos together.
+    shares = [row["station_shows_percent_of_missing"] for row in rows]
+    assert set(shares[1::3] + shares[2::3]) == {""}
+    assert sum(shares[::3]) == pytest.approx(100 * sum(station.shows for station in plan.stations), abs=0.2)
     # GPS may count heights from another zero than the scene does.
-    higher = photo_rows(plan, photos.views, frame, gps_higher=47.0)
+    higher = photo_rows(plan, 0.0, frame, gps_higher=47.0)
     assert {round(b["altitude_m"] - a["altitude_m"], 2) for a, b in zip(rows, higher)} == {47.0}
 
 
