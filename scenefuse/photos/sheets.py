@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -38,15 +39,17 @@ def draw_sheet(
         labels: one a row, written upwards at its left; none where this is empty.
     """
     shape, lines = (len(rows), max(map(len, rows))), 2 + len(note.splitlines())
-    width, height = (MARGIN_PX + count * (side + MARGIN_PX) for count, side in zip(shape[::-1], tile_px))
+    # Text grows with the pictures, so that it is read where a page shows the sheet small.
+    zoom = max(1.0, tile_px[0] / TILE_PX[0])
+    width, height = (MARGIN_PX + count * (side / zoom + MARGIN_PX) for count, side in zip(shape[::-1], tile_px))
     height += (lines - 1) * MARGIN_PX
-    figure = Figure(figsize=(width / 100, height / 100), dpi=100)
+    figure = Figure(figsize=(width / 100, height / 100), dpi=100 * zoom)
     FigureCanvasAgg(figure)
     left, line = MARGIN_PX / width, MARGIN_PX / height
     cells = figure.subplots(
         *shape, squeeze=False, subplot_kw={"xticks": [], "yticks": []},
         gridspec_kw={"left": left, "right": 1 - left, "bottom": line, "top": 1 - lines * line}
-        | dict(zip(("wspace", "hspace"), np.divide(MARGIN_PX, tile_px))),
+        | dict(zip(("wspace", "hspace"), np.divide(zoom * MARGIN_PX, tile_px))),
     )  # fmt: skip
     figure.text(left, 1 - line / 4, title, fontsize="large", fontweight="bold", va="top")
     figure.text(left, 1 - line, note, color="0.3", va="top")
@@ -61,6 +64,23 @@ def draw_sheet(
     for row, label in zip(cells, labels):
         row[0].set_ylabel(label, fontsize="large")
     return figure
+
+
+def draw_scale(axes: Any, px_per_unit: float, unit: str, has_north: bool) -> None:
+    """A scale bar at the lower left of a map; an arrow above it to the north, where it is known to be up."""
+    right, low = axes.get_xlim()[1], axes.get_ylim()[0]
+    bar, start, box = round_below(right / px_per_unit / 4), 0.04 * right, {"color": "white", "alpha": 0.7, "pad": 1}
+    axes.plot([start, start + bar * px_per_unit], [0.96 * low] * 2, color="black", linewidth=3, zorder=5)
+    axes.text(start, 0.94 * low, f"{bar:g} {unit}", zorder=5, bbox=box)
+    if has_north:
+        arrow = {"arrowstyle": "-|>", "color": "black"}
+        axes.annotate("N", (start, 0.68 * low), (start, 0.82 * low), ha="center", zorder=5, arrowprops=arrow, bbox=box)
+
+
+def round_below(value: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not above a value."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * max((k for k in (2, 5) if k * power <= value), default=1))
 
 
 def depth_colors(depth: NDArray[np.float32], low: float, high: float) -> Image:

@@ -12,6 +12,7 @@ from PIL import Image
 
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.version import VERSION
+from scenefuse.photos.sheets import round_below
 from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scene_facts, surface_facts, title_of
 from scenefuse.report.values import WORDS, length
 from scenefuse.surface.gltf import metres_per_unit
@@ -77,7 +78,7 @@ class _Page(FPDF):
         """The project, its maker and the number of the page."""
         self.set_y(-self.l_margin)
         self.set_font("sans", size=7)
-        self.cell(0, 4, f"{self.project}. {self.made}", align="L")
+        self.cell(0, 4, shorten(f"{self.project}. {self.made}", 130), align="L")
         self.cell(0, 4, f"{self.page_no()}", align="R")
 
     def start(self, name: str, below: str) -> None:
@@ -85,7 +86,7 @@ class _Page(FPDF):
         self.add_page()
         self.text_line(name, 16)
         self.set_font("sans", size=9)
-        self.cell(0, 6, below, new_x="LMARGIN", new_y="NEXT")
+        self.multi_cell(0, 5, below, align="L", new_x="LMARGIN", new_y="NEXT")
         self.ln(GAP_MM)
 
     def text_line(self, text: str, size: int) -> None:
@@ -153,7 +154,7 @@ class _Page(FPDF):
             y = top + k // 2 * (height * per_unit + 2 * GAP_MM)
             self.image(Image.fromarray(pixels), x, y, pixels.shape[1] * pixel * per_unit)
             self.text(x, y + height * per_unit + 3, f"from the {side}")
-        bar = 10.0 ** np.floor(np.log10(width / 2))
+        bar = round_below(width / 2)
         self.set_y(top + 2 * (height * per_unit + 2 * GAP_MM) + 2)
         self.set_line_width(1)
         self.line(self.l_margin, self.get_y(), self.l_margin + bar * per_unit, self.get_y())

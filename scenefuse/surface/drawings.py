@@ -1,6 +1,7 @@
 """Drawings of a surface to scale: from above in the CRS, and elevations along the object's own walls (method F9)."""
 
 from dataclasses import dataclass, replace
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,13 @@ from rasterio.enums import ColorInterp
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
+from scenefuse.cloud.crs import crs_name
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, threads, write_json
 from scenefuse.core.transforms import UP, Array
 from scenefuse.fuse.compare import MARGIN
 from scenefuse.fuse.measure import SUPPORT
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
+from scenefuse.photos.sheets import round_below
 from scenefuse.surface.gltf import BRIDGED_TINT, Painted, metres_per_unit, read_painted
 from scenefuse.surface.make_surface import read_surface
 from scenefuse.surface.mesh import FaceClass, Surface, cast, caster
@@ -207,8 +210,8 @@ def draw_surface(
             title = f"{name} {where}{azimuth}"
             title += f"; 1:{scale}" if unit != "scene units" else ""
             left = drawing.left + shift[0] if side == "above" else 0.0
-            note = "" if crs is None else f"; {pyproj.CRS.from_user_input(crs).name}, north is up"
-            figure = _sheet(drawing, title, counted, metres / ratio / scale, (left, drawing.top + shift[1]), note)
+            corner = (left, drawing.top + shift[1])
+            figure = _sheet(drawing, title, counted, metres / ratio / scale, corner, crs)
             figure.savefig(output / f"{side}.png", dpi=200)
             pages.savefig(figure)
             report[f"{side}_pixel"], report[f"{side}_scale"] = quantity(drawing.pixel, counted), quantity(scale, "1")
@@ -271,7 +274,7 @@ def _scale(drawing: Drawing, metres: float) -> int:
 
 
 def _sheet(
-    drawing: Drawing, title: str, unit: str, page_per_unit: float, corner: tuple[float, float], note: str
+    drawing: Drawing, title: str, unit: str, page_per_unit: float, corner: tuple[float, float], crs: str | None
 ) -> Figure:
     """A page with a frame, a scale bar and tinted bridges.
 
@@ -281,7 +284,7 @@ def _sheet(
         unit: of lengths.
         page_per_unit: metres of the page for a unit.
         corner: what the frame says of its upper left.
-        note: goes on behind the legend.
+        crs: whose north is up; None for another drawing.
     """
     inch = 0.0254
     height, width = (side * drawing.pixel for side in drawing.classes.shape)
@@ -296,10 +299,12 @@ def _sheet(
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.tick_params(labelsize=7)
     axes.set_title(f"{title} ({unit})", fontsize=10)
-    bar = 10.0 ** np.floor(np.log10(width / 4))
-    bar *= next(k for k in (5, 2, 1) if k * bar <= width / 2)
+    bar = round_below(width / 2)
     left, low = (1 - size[0]) / 2, (1 - size[1]) / 2 - 0.05
     figure.add_artist(Line2D([left, left + bar * page_per_unit / PAGE[0]], [low, low], color="black", linewidth=4))
     figure.text(left, low + 0.01, f"{bar:g} {unit}", fontsize=8)
-    figure.text(left, low - 0.02, f"purple: interpolated; grey: not measured{note}", fontsize=8)
+    figure.text(left, low - 0.02, f"purple: interpolated; grey: not measured; drawn {date.today()}", fontsize=8)
+    if crs is not None:
+        figure.text(left, low - 0.04, crs_name(crs), fontsize=8)
+        axes.annotate("N", (1.03, 1), (1.03, 0.9), "axes fraction", ha="center", arrowprops={"arrowstyle": "-|>"})
     return figure

@@ -20,6 +20,7 @@ from support.photographed_plane import photographs
 
 from scenefuse import command_line
 from scenefuse.cloud.clouds import Cloud, write_cloud
+from scenefuse.cloud.crs import crs_name
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3, look_at
 from scenefuse.fuse.measure import Evidence
@@ -356,6 +357,17 @@ def test_an_elevation_has_the_scale_that_it_says(drawings):
     assert (drawings / "drawings.pdf").read_bytes()[:4] == b"%PDF"
 
 
+def test_a_drawing_names_its_day_and_a_plan_its_crs_with_an_arrow_to_the_north(drawings, placed):
+    def said(folder):
+        return [page.get_textpage().get_text_bounded() for page in pypdfium2.PdfDocument(folder / "drawings.pdf")]
+
+    name = crs_name(value(read_json(placed / "drawings.json"), "crs"))
+    for plain, page, side in zip(said(drawings), said(placed), SIDES):
+        assert re.search(r"drawn 20\d\d-\d\d-\d\d", plain) and (name in page) == (side == "above")
+        assert (re.search(r"^N\b", page, re.MULTILINE) is not None) == (side == "above")
+        assert not re.search(r"^N\b", plain, re.MULTILINE)
+
+
 def test_a_facade_is_drawn_of_the_plane_through_three_points_from_outside(coarse, placed):
     for order in ([0, 1, 2], [1, 0, 2]):
         np.testing.assert_allclose(
@@ -592,6 +604,10 @@ def test_paper_begins_with_an_overview_and_gives_an_object_two_pages_with_its_si
     )
     pages = [page.get_textpage().get_text_bounded() for page in pypdfium2.PdfDocument(tmp_path / "r.pdf")]
     assert len(pages) == 3
+    # Nothing runs off the page.
+    assert all(
+        box[2] < 595 for box in (one.get_bounds() for one in pypdfium2.PdfDocument(tmp_path / "r.pdf")[0].get_objects())
+    )
     assert "Hof Müller" in pages[0] and "Scene yard" in pages[0] and "ETRS89 / UTM zone 32N (EPSG:25832)" in pages[0]
     assert "completed" in pages[0] and "11.4 m × 10.0 m, 8.10 m high" in pages[0] and "11.4 m" in pages[1]
     assert "from the north" in pages[2] and "1.00 scene units" in pages[2] and "1:" not in pages[2]
