@@ -60,7 +60,7 @@ def object_facts(row: Row) -> dict[str, str]:
         if has.get("ground_missing"):
             facts["Surface"] += f"; of the ground at its foot {percent(has['ground_missing'])} is missing"
     if found := accuracies(row):
-        absolute = "; that is relative: on Earth it is known as well as the scene (see Position)"
+        absolute = "; on Earth as exact as the scene (see Position)"
         facts["Accuracy"] = found[0] + (absolute if "crs" in has else "")
     if "scale_sd_log" in has:
         facts["Scale"] = _trust(scale_sd(row), unit) + ("" if has.get("scene_scale_sd_log") else ", beside the scene's")
@@ -304,12 +304,18 @@ def photographed(photos_json: Path, folder: Path) -> str | None:
     return " to ".join(dict.fromkeys([min(days), max(days)])) if days else None
 
 
-def ground_pixel(folder: Path) -> float | None:
-    """What a pixel covers at the depth of what the photos show (median), in the model's unit; None without a model."""
+def of_cameras(folder: Path) -> dict[str, Any]:
+    """What a pixel covers at the depth of what the photos show (median), in the model's unit, and the lenses, as COLMAP
+    names their parameters; nothing without a model."""
     try:
         model = read_model(folder)
     except StageError:
-        return None
+        return {}
+    lenses = [
+        f"{lens.model.name} {lens.width} × {lens.height} {lens.params_info}: "
+        + " ".join(f"{p:.5g}" for p in lens.params)
+        for lens in model.cameras.values()
+    ]
     images, found = posed_images(model), []
     for image in images[:: max(1, len(images) // LOOKED_AT)]:
         seen = np.array([model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()])
@@ -317,7 +323,7 @@ def ground_pixel(folder: Path) -> float | None:
             pose = image.cam_from_world().matrix()
             depth = float(np.median(seen @ pose[2, :3] + pose[2, 3]))
             found.append(depth / model.cameras[image.camera_id].mean_focal_length())
-    return float(np.median(found)) if found else None
+    return {"ground_pixel": float(np.median(found)) if found else None, "lens": named(lenses, "; ")}
 
 
 def _known(row: Row) -> dict[str, Any]:

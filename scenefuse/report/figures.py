@@ -18,17 +18,18 @@ from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.fuse.fuse_object import is_placed
 from scenefuse.fuse.missing import Lack
 from scenefuse.fuse.write import after_fusion
+from scenefuse.photos.geodesy import compass
 from scenefuse.photos.pictures import read_depth, read_mask, read_rgb
-from scenefuse.photos.sheets import TILE_PX, Cell, Image, depth_colors, draw_sheet, save_png
+from scenefuse.photos.sheets import TILE_PX, Cell, Image, depth_colors, draw_scale, draw_sheet, save_png
 from scenefuse.photos.workspace import read_views
-from scenefuse.report.render import luminance, orbit_camera, point_radii, render
+from scenefuse.report.render import camera_at, luminance, orbit_camera, point_radii, render
 from scenefuse.report.values import WORDS, load, unit_of
 from scenefuse.report.view import REACH, view_of, within, write_view
 from scenefuse.sfm.gravity import estimate_up
 
 SCENE = "#cdd0d4"
 LACKS = {
-    Lack.NEVER_SEEN: ("red", "#d6261f"), Lack.UNTEXTURED: ("blue", "#3465c4"), Lack.CONTRADICTED: ("purple", "#963caa")
+    Lack.NEVER_SEEN: ("red", "#d6261f"), Lack.UNTEXTURED: ("blue", "#3465c4"), Lack.CONTRADICTED: ("yellow", "#e0a800")
 }  # fmt: skip
 # Azimuths of the four sides that a row of pictures shows.
 SIDES_DEG = (30.0, 120.0, 210.0, 300.0)
@@ -50,6 +51,7 @@ class Surroundings:
         unit: of the scene's lengths.
         missing: cells of the object's surface that the completed scene lacks; None where they were not looked for.
         stations: (S, 3) places to photograph these from, best first.
+        has_north: whether y is north.
     """
 
     before: Cloud
@@ -61,6 +63,7 @@ class Surroundings:
     unit: str
     missing: Cloud | None
     stations: Array
+    has_north: bool
 
 
 @dataclass(frozen=True)
@@ -190,24 +193,27 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     cloud, sizes = Cloud(np.concatenate([join.after.points, cells.points])), np.append(radii, np.full(len(cells), side))
     from_above = orbit_camera(np.concatenate([join.framed, join.stations]), -90.0, 90.0, TILE_PX, orthographic=True)
     cameras = {"from above, with the stations": from_above}
-    toward = join.stations[: len(SIDES_DEG) - 1] - (join.framed.min(0) + join.framed.max(0)) / 2
-    for number, (x, y, z) in enumerate(toward, 1):
-        turn, height = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]).tolist()
-        label = f"from station {number}, {np.linalg.norm([x, y, z]):.3g} {join.unit} away"
-        cameras[label] = orbit_camera(join.framed, turn, height, TILE_PX)
+    shown_from, middle = join.stations[: len(SIDES_DEG) - 1], (join.framed.min(0) + join.framed.max(0)) / 2
+    for number, place in enumerate(shown_from, 1):
+        x, y, z = place - middle
+        label = f"from station {number}, {np.linalg.norm([x, y, z]):.3g} {join.unit}"
+        label += f" to the {compass(np.degrees(np.arctan2(x, y)))}" if join.has_north else " away"
+        cameras[label] = camera_at(place, join.framed, TILE_PX)
     for azimuth in SIDES_DEG[len(cameras) :]:
         cameras[f"azimuth {azimuth:.0f}°"] = orbit_camera(join.framed, azimuth, 20.0, TILE_PX)
     pictures = [(label, render(cloud, camera, sizes, colors)) for label, camera in cameras.items()]
     seen = ", ".join(f"{color}: {WORDS['missing'][kind.name.lower()]}" for kind, (color, _) in LACKS.items())
-    shown = f", the best {len(toward)} shown" if len(toward) < len(join.stations) else ""
+    shown = f", the best {len(shown_from)} shown" if len(shown_from) < len(join.stations) else ""
     note = f"{seen}\n{len(join.stations)} stations to photograph it from{shown}; where they are: next_photos.csv"
     sheet = draw_sheet(f"{name}: what is still missing", note, [pictures[:2], pictures[2:]])
-    axes, middle = sheet.axes[0], from_above.project(join.framed.mean(0, keepdims=True))[0][0]
-    for number, place in enumerate(from_above.project(join.stations)[0], 1):
+    axes, target = sheet.axes[0], from_above.project(middle[None])[0][0]
+    draw_scale(axes, from_above.focal_px, join.unit, join.has_north)
+    # The best one lies on top, where two are close to each other.
+    for number, at in reversed([*enumerate(from_above.project(join.stations)[0], 1)]):
         arrow = {"arrowstyle": "->", "color": "0.5", "shrinkB": 40}
-        mark = {"boxstyle": "circle", "color": LACKS[Lack.NEVER_SEEN][1]}
+        mark = {"boxstyle": "circle,pad=0.15", "facecolor": "black", "edgecolor": "white"}
         axes.annotate(
-            str(number), middle, place, arrowprops=arrow, bbox=mark, color="white", ha="center", va="center"
+            str(number), target, at, arrowprops=arrow, bbox=mark, color="white", ha="center", va="center"
         )  # fmt: skip
     return sheet
 
@@ -327,4 +333,5 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
     photos = pd.read_csv(inputs.next_photos)
     # The middle one of the three photos of a station.
     stations = photos[photos.photo == 2].filter(like="local_").to_numpy(np.float64).reshape(-1, 3)
-    return Surroundings(before, after, placed, inner(shown), fused, decision, unit, missing, stations)
+    has_north = "longitude_deg" in photos
+    return Surroundings(before, after, placed, inner(shown), fused, decision, unit, missing, stations, has_north)

@@ -100,6 +100,14 @@ def orbit_camera(
     return Camera(rotation, middle + distance * direction, float(focal), *size_px)
 
 
+def camera_at(place: Array, framed: Array, size_px: tuple[int, int], margin: float = 0.06) -> Camera:
+    """A camera at a place (3,) that looks at the middle of some points (N, 3) and just fits those before it."""
+    rotation = look_at(place, (framed.min(0) + framed.max(0)) / 2.0, np.array([0.0, 0.0, 1.0]))
+    x, y, depth = np.abs((framed - place) @ rotation.T).T
+    reach = np.max([x / size_px[0], y / size_px[1]], axis=0) / np.maximum(depth, 0.1 * depth.max())
+    return Camera(rotation, place, float((0.5 - margin) / max(reach.max(), 1e-9)), *size_px)
+
+
 def point_radii(
     points: Array,
     factor: float = 0.9,

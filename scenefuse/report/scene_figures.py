@@ -11,15 +11,16 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud
 from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array, box_corners
 from scenefuse.photos.geodesy import length_unit
-from scenefuse.photos.sheets import TILE_PX, Cell, draw_sheet, save_png
+from scenefuse.photos.sheets import TILE_PX, Cell, draw_scale, draw_sheet, save_png
 from scenefuse.photos.workspace import View as PhotoView
-from scenefuse.photos.workspace import read_model, read_views
+from scenefuse.photos.workspace import read_views
 from scenefuse.report.render import MAX_DRAWN, Camera, orbit_camera, point_radii, render
 from scenefuse.report.values import read_table
 from scenefuse.report.view import view_of, within, write_view
@@ -35,6 +36,7 @@ def draw_scene(
     dense: Path,
     georeferenced: Path | None = None,
     residuals: Path | None = None,
+    georeference_json: Path | None = None,
     objects: list[Path],
     failed: tuple[str, ...] = (),
     figure: Path,
@@ -46,6 +48,7 @@ def draw_scene(
         dense: the scene's dense cloud.
         georeferenced: COLMAP model in the same frame; None where the scene was given as a cloud.
         residuals: what is left at positions by GPS (residuals.tsv); None where the scene was given as a cloud.
+        georeference_json: says the unit of lengths, and whether up on the picture is north.
         objects: result folders of the scene's objects; the bounding box of registration/full/crop.ply is drawn.
         failed: names of the objects that failed; they get no box.
         figure: output PNG.
@@ -62,24 +65,26 @@ def draw_scene(
     boxes = {name: box_corners(crop.min(0), crop.max(0)) for name, crop in crops.items()}
     drawn = "" if every == 1 else f" (one in {every} is drawn)"
     note = f"{len(scene):,} points{drawn}, objects (boxes): {len(boxes)}, "
-    note += f"cameras (red): {len(views)}\n{_calibration(georeferenced)}" if georeferenced else "given as a cloud"
+    note += f"cameras (red): {len(views)}" if georeferenced else "given as a cloud"
     errors = pd.DataFrame() if residuals is None else read_table(residuals)
-    save_png(figure, _scene_sheet(f"Scene {name}", note, cloud, views, boxes, errors))
-
-
-def _calibration(model: Path) -> str:
-    """The lenses of a model in a line, as COLMAP names their parameters."""
-    lenses = []
-    for camera in read_model(model).cameras.values():
-        values = [f"{name.strip()} {number:.5g}" for name, number in zip(camera.params_info.split(","), camera.params)]
-        lenses.append(f"{camera.model.name}, {camera.width} × {camera.height}: {', '.join(values)}")
-    return f"Lens: {lenses[0]}" + (f", and {len(lenses) - 1} more" if lenses[1:] else "")
+    known = {} if georeference_json is None else read_json(georeference_json)
+    place = length_unit(georeference_json), "crs" in known
+    save_png(figure, _scene_sheet(f"Scene {name}", note, cloud, views, boxes, errors, place))
 
 
 def _scene_sheet(
-    title: str, note: str, cloud: Cloud, views: list[PhotoView], boxes: dict[str, Array], errors: pd.DataFrame
+    title: str,
+    note: str,
+    cloud: Cloud,
+    views: list[PhotoView],
+    boxes: dict[str, Array],
+    errors: pd.DataFrame,
+    place: tuple[str, bool],
 ) -> Figure:
-    """The scene from above and obliquely, with boxes of 8 corners; where it has cameras, their errors and overlap."""
+    """The scene from above and obliquely, with boxes of 8 corners; where it has cameras, their errors and overlap.
+
+    Place is the unit of lengths, and whether the map's upper edge lies in the north.
+    """
     radii, size = point_radii(cloud.points), (2 * TILE_PX[0], 2 * TILE_PX[1])
     ground = box_corners(*np.percentile(cloud.points, [1, 99], axis=0))
     centres = np.array([view.centre for view in views]).reshape(-1, 3)
@@ -93,14 +98,12 @@ def _scene_sheet(
         most = len(OVERLAP_COLORS) - 1
         overlap = render(cloud, above, radii, OVERLAP_COLORS[np.minimum(counts, most)])
         errors_below = render(cloud, above, radii, (215, 215, 215))
-        rows.append(
-            [("camera positions: by photos less by GPS", errors_below), ("overlap: photos that frame a place", overlap)]
-        )
+        rows.append([("cameras against their GPS", errors_below), ("photos that show a place", overlap)])
     sheet = draw_sheet(title, note, rows, size)
     axes: Any
     for axes, camera in zip(sheet.axes, (above, oblique)):
         axes.scatter(
-            *np.transpose(camera.project(centres)[0]), s=14, c=RED, edgecolors="white", linewidths=0.5, zorder=3
+            *np.transpose(camera.project(centres)[0]), s=8, c=RED, edgecolors="white", linewidths=0.3, zorder=3
         )
         for label, corners in boxes.items():
             _draw_box(axes, camera.project(corners)[0], label)
@@ -108,8 +111,10 @@ def _scene_sheet(
         for number, color in enumerate(OVERLAP_COLORS):
             label = f"{number}" + (" or more" if number == most else "")
             sheet.axes[3].plot([], [], "s", color=color / 255, label=label)
-        sheet.axes[3].legend(loc="lower center", ncols=most + 1, handletextpad=0, columnspacing=0.6)
+        sheet.axes[3].legend(loc="lower center", ncols=most + 1, handletextpad=0, columnspacing=0.4, fontsize="x-small")
         _draw_errors(sheet.axes[2], above, {view.name: view.centre for view in views}, errors)
+    for axes in sheet.axes[: 3 if views else 1 : 2]:
+        draw_scale(axes, above.focal_px, *place)
     return sheet
 
 
@@ -122,8 +127,9 @@ def _draw_errors(axes: Any, camera: Camera, centres: dict[str, Array], errors: p
         return
     pixels = camera.project(np.array([centres[name] for name in errors.name]))[0]
     sides = errors[["east_m", "north_m"]].abs().to_numpy()
-    # The median error is as large on the picture as a twentieth of its height, in a round factor.
-    factor = 0.05 * camera.height_px / camera.focal_px / max(float(np.median(np.linalg.norm(sides, axis=1))), 1e-9)
+    # A large error reaches half way to the next camera, in a round factor: few ellipses overlap.
+    apart = np.median(cKDTree(pixels).query(pixels, k=2)[0][:, 1]) if len(pixels) > 1 else 0.1 * camera.height_px
+    factor = 0.5 * float(apart) / camera.focal_px / max(float(np.percentile(sides.max(1), 90)), 1e-9)
     factor = float(f"{factor:.0e}")
     limit, widths = float(errors.up_m.abs().max()) or 1.0, 2 * factor * camera.focal_px * sides
     shapes = EllipseCollection(
@@ -132,10 +138,10 @@ def _draw_errors(axes: Any, camera: Camera, centres: dict[str, Array], errors: p
     )  # fmt: skip
     shapes.set_array(errors.up_m.fillna(0.0).to_numpy())
     axes.add_collection(shapes)
-    axes.scatter(*pixels.T, s=5, c="black", zorder=4)
-    scale = axes.figure.colorbar(shapes, cax=axes.inset_axes((0.7, 0.1, 0.27, 0.025)), orientation="horizontal")
-    scale.set_label("upwards (m)")
-    axes.set_title(f"{axes.get_title()}, east and north enlarged {factor:,.0f} times", fontsize="medium", pad=3)
+    axes.scatter(*pixels.T, s=2, c="black", zorder=4)
+    scale = axes.figure.colorbar(shapes, cax=axes.inset_axes((0.7, 0.17, 0.25, 0.025)), orientation="horizontal")
+    scale.set_label("above GPS (m)")
+    axes.set_title(f"{axes.get_title()}: east, north × {factor:,.3g}", fontsize="medium", pad=3)
 
 
 def _draw_box(axes: Any, corners_px: Array, label: str) -> None:

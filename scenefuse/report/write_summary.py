@@ -18,10 +18,10 @@ from scenefuse.report.facts import (
     BETWEEN,
     accuracies,
     diagnose,
-    ground_pixel,
     is_current,
     made_by,
     object_facts,
+    of_cameras,
     photographed,
     scene_facts,
 )
@@ -153,7 +153,7 @@ def scenes_table(scenes: list[SceneSummary], inputs: RunInputs) -> pd.DataFrame:
         row: dict[str, Any] = {"scene": scene.name, "made_by": maker or None} | _columns(fields, "scenes")
         if "georeference.length_unit" in fields:
             row["photographed"] = photographed(folder / "photos.json", folder / "photos")
-            row["ground_pixel"] = ground_pixel(folder / "georeferenced")
+            row |= of_cameras(folder / "georeferenced")
         row["gps_scale_sd_log"] = _scale_sd(fields)
         row["completed_by"] = None if added is None else ", ".join(added) or "none"
         for key, entry in fields.items():

@@ -348,7 +348,7 @@ QUESTIONS = {
     "what next?": "photograph it from 4 places",
     "who made it?": r"Made with scenefuse \d.* on 20\d\d-\S+ by Hof Müller",
     "which frame?": r"with its surroundings \(local frame, metres\)",
-    "what is that beside the GPS?": r"relative: on Earth it is known as well as the scene",
+    "what is that beside the GPS?": r"on Earth as exact as the scene \(see Position\)",
 }
 SHOWN = """
 const found = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);

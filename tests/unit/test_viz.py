@@ -10,10 +10,11 @@ from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.photos.pictures import write_depth
+from scenefuse.photos.sheets import draw_scale, draw_sheet, round_below
 from scenefuse.photos.workspace import read_views
 from scenefuse.report.figures import FigureInputs, draw_lone_object, draw_object
 from scenefuse.report.page import view_section
-from scenefuse.report.render import Camera, orbit_camera, point_radii, render
+from scenefuse.report.render import Camera, camera_at, orbit_camera, point_radii, render
 from scenefuse.report.scene_figures import draw_scene, view_scene
 from scenefuse.report.view import Shown, read_view
 
@@ -52,6 +53,35 @@ def test_orbit_camera_frames_the_points_up_to_the_margin(orthographic, elevation
     assert (depth > 0).all()
     # The outermost point touches the margin of a tenth on each side: 0.8 of the half image.
     assert (np.abs(pixels - [100, 75]) / [100, 75]).max() == pytest.approx(0.8)
+
+
+def test_a_camera_at_a_place_stays_there_and_frames_the_points_up_to_the_margin():
+    points, place = np.random.default_rng(0).uniform([-3, 4, 0], [1, 9, 2], (500, 3)), np.array([6.0, -8.0, 1.5])
+    camera = camera_at(place, points, (200, 150), margin=0.1)
+    pixels, depth = camera.project(points)
+    assert (depth > 0).all() and np.array_equal(camera.centre, place)
+    assert (np.abs(pixels - [100, 75]) / [100, 75]).max() == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("has_north", [True, False])
+def test_a_map_has_a_scale_bar_of_a_round_length_and_an_arrow_where_north_is_known(has_north):
+    sheet = draw_sheet("a", "b", [[("from above", np.full((300, 400, 3), 255, np.uint8))]])
+    draw_scale(sheet.axes[0], 7.0, "m", has_north)
+    (bar,) = sheet.axes[0].lines
+    assert np.ptp(bar.get_xdata()) == pytest.approx(7 * 10)  # a quarter of the picture is 14.3 m
+    said = {text.get_text(): text for text in sheet.axes[0].texts}
+    assert "10 m" in said and ("N" in said) == has_north
+    if has_north:  # the arrow points from the letter to the upper edge
+        assert said["N"].xy[1] < said["N"].xyann[1] and said["N"].xy[0] == said["N"].xyann[0]
+    assert [round_below(value) for value in (0.9, 1.0, 4.9, 5.1, 30.0)] == [0.5, 1, 2, 5, 20]
+
+
+def test_text_of_a_sheet_of_larger_pictures_is_larger_and_its_pictures_keep_their_pixels():
+    for size in ((400, 300), (800, 600)):
+        picture = np.full((size[1], size[0], 3), 255, np.uint8)
+        sheet = draw_sheet("a", "b", [[("c", picture)]], size)
+        assert sheet.dpi == size[0] / 4
+        assert sheet.axes[0].get_window_extent().size == pytest.approx(size, abs=1)
 
 
 def test_the_nearer_surface_hides_the_farther_one_and_holes_stay_background():
@@ -277,6 +307,25 @@ def test_figures_show_what_was_added(figures):
     colors = cv2.cvtColor(cv2.imread(str(figures / "missing.png")), cv2.COLOR_BGR2RGB).astype(int)
     for first, last in ((0, 2), (2, 0)):
         assert (colors[..., first] - colors[..., last] > 70).sum() > 50
+
+
+def test_stations_are_named_by_where_they_stand_if_north_is_known(capture, tmp_path, monkeypatch):
+    labels = list[str]()
+
+    def sheet(title, note, rows, **options):
+        labels.extend(caption for row in rows for caption, _ in row)
+        return draw_sheet(title, note, rows, **options)
+
+    monkeypatch.setattr("scenefuse.report.figures.draw_sheet", sheet)
+    table, plain = capture / "next_photos.csv", (capture / "next_photos.csv").read_text()
+    draw(capture, REGISTERED, tmp_path / "plain")
+    table.write_text(plain.replace("photo,", "photo,longitude_deg,").replace("1,2,3,1,3", "1,2,8.5,3,1,3"))
+    draw(capture, REGISTERED, tmp_path / "placed")
+    table.write_text(plain)
+    assert [label for label in labels if "station 1" in label] == [
+        "from station 1, 4.03 m away",
+        "from station 1, 4.03 m to the east",
+    ]
 
 
 def test_an_object_that_lacks_nothing_is_drawn(capture, tmp_path):

@@ -23,6 +23,7 @@ rule draw_scene:
         cloud="results/scenes/{scene}/dense.ply",
         georeferenced=if_flown("georeferenced"),
         residuals=if_flown("residuals.tsv"),
+        georeference="results/scenes/{scene}/georeference.json",
         crops=of_objects("registration/full/crop.ply"),
     output:
         report(
@@ -48,7 +49,7 @@ rule draw_scene:
         "Scene {wildcards.scene}: figure"
     shell:
         "exec python {params.script} --name {wildcards.scene} --dense {input.cloud} {params.cameras}"
-        " --objects {params.objects} --figure {output} &> {log}"
+        " --georeference-json {input.georeference} --objects {params.objects} --figure {output} &> {log}"
 
 
 rule draw_object:
