@@ -361,9 +361,7 @@ def write_las(path, form, count):
 
 
 @pytest.mark.parametrize("count", [0, 25])
-@pytest.mark.parametrize(
-    "name", ["a.las", "a.laz", "b.las", "b.laz", "text.ply", "binary.ply", "ascii.pcd", "binary.pcd"]
-)
+@pytest.mark.parametrize("name", ["a.las", "b.las", "b.laz", "text.ply", "binary.ply", "ascii.pcd", "binary.pcd"])
 def test_a_file_that_holds_more_points_than_its_header_counts_is_refused(tmp_path, name, count):
     path, points = tmp_path / name, np.array(GRID, "<f4")
     if path.suffix in (".las", ".laz"):

@@ -113,7 +113,7 @@ rule register_object:
     threads: min(2, OBJECT_THREADS)
     resources:
         mem_mb=by_size(4000, cloud=4, crop=4),
-        runtime=lambda wildcards, attempt: 60 * attempt,
+        runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options=variant_options("scale", "coarse", "fine"),
         gravity=options_of("workspace_json"),
@@ -158,7 +158,7 @@ rule register_as_paper:
     threads: min(2, OBJECT_THREADS)
     resources:
         mem_mb=by_size(4000, cloud=4, crop=4),
-        runtime=lambda wildcards, attempt: 60 * attempt,
+        runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options="--scale rms",
         gravity=options_of("workspace_json"),
