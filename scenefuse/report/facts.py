@@ -64,12 +64,11 @@ def object_facts(row: Row) -> dict[str, str]:
         facts["Accuracy"] = found[0] + (absolute if "crs" in has else "")
     if "scale_sd_log" in has:
         facts["Scale"] = _trust(scale_sd(row), unit) + ("" if has.get("scene_scale_sd_log") else ", beside the scene's")
+        facts["Scale"] += ", not in metres" if unit == "scene units" else ""
     if "registered" in has and "frames" in has:
-        facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used"
-        facts["Photos"] += f", taken {has['photographed']}" if "photographed" in has else ""
+        taken = f"taken {has['photographed']}" if "photographed" in has else "undated"
+        facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used, {taken}"
     folder = f"results/objects/{has['object']}"
-    if has.get("added_points") and "removed_points" in has:
-        facts["Points"] = f"{has['added_points']:,.0f} added, {has['removed_points']:,.0f} of the scene's removed"
     if "added_points" in has:
         facts["File"] = f"{folder}/fused.ply with its surroundings (local frame, {_plural(unit)})"
     elif status == ALONE:
@@ -180,10 +179,10 @@ def scene_facts(row: Row) -> dict[str, str]:
             facts["Result"] += f"{has['removed_points']:,.0f} that close-ups contradict or measured better"
     elif "points" in has:
         facts["Result"] = f"{has['points']:,.0f} points, not completed with all objects yet"
-    photos = "given as a cloud"
+    facts["Photographed"] = "given as a cloud"
     if "registered" in has and "photos" in has:
-        photos = f"{has['registered']:.0f} of {has['photos']:.0f} photos used"
-    facts["Photographed"] = ", ".join(filter(None, [has.get("photographed"), photos]))
+        used = f"{has['registered']:.0f} of {has['photos']:.0f} photos used"
+        facts["Photographed"] = f"{has.get('photographed', 'undated')}, {used}"
     if unit == "m":
         facts["Coordinates"] = f"metres, {crs_name(has['crs'])}" if "crs" in has else "metres, in a local frame"
     else:

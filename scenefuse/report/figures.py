@@ -213,7 +213,7 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
         arrow = {"arrowstyle": "->", "color": "0.5", "shrinkB": 40}
         mark = {"boxstyle": "circle,pad=0.15", "facecolor": "black", "edgecolor": "white"}
         axes.annotate(
-            str(number), target, at, arrowprops=arrow, bbox=mark, color="white", ha="center", va="center"
+            str(number), target, at, arrowprops=arrow, bbox=mark, color="white", ha="center", va="center", zorder=6
         )  # fmt: skip
     return sheet
 

@@ -269,8 +269,7 @@ def _scale(drawing: Drawing, metres: float) -> int:
     """N of the largest scale 1:N, N = 1, 2 or 5 times a power of ten, at which a drawing fits on the page."""
     height, width = drawing.classes.shape
     needed = metres * drawing.pixel * max(width / DRAWN[0], height / DRAWN[1])
-    power = 10.0 ** np.floor(np.log10(needed))
-    return max(1, round(next(k for k in (1, 2, 5, 10) if k * power >= needed) * power))
+    return max(1, round(1 / round_below(1 / needed)))
 
 
 def _sheet(

@@ -13,7 +13,7 @@ from PIL import Image
 
 from scenefuse.core.job_records import KILLED, NO_LOG, NOT_ACCEPTED, JobRecords, why_ended, why_unfinished
 from scenefuse.core.stage import StageError, quantity, write_json
-from scenefuse.report.facts import closing_lines, scene_facts, title_of
+from scenefuse.report.facts import closing_lines, object_facts, scene_facts, title_of
 from scenefuse.report.run_summary import RunInputs
 from scenefuse.report.values import find, flatten, length, load, number, percent, percents
 from scenefuse.report.write_report import write_report
@@ -596,6 +596,17 @@ def test_shares_and_lengths_are_written_as_people_do():
     ]
     lengths = [(0.0072, "m"), (0.256, "m"), (11.42, "m"), (0.5, "scene units"), (1234.5, "m")]
     assert [length(*given) for given in lengths] == ["7.20 mm", "25.6 cm", "11.4 m", "0.500 scene units", "1,234 m"]
+
+
+def test_photos_without_a_date_are_called_undated():
+    row = {"registered": 12, "photos": 12, "frames": 12}
+    assert scene_facts({"scene": "yard"} | row)["Photographed"] == "Undated, 12 of 12 photos used"
+    assert object_facts({"object": "house", "status": "registered"} | row)["Photos"] == "12 of 12 used, undated"
+
+
+def test_lengths_of_an_object_in_a_scene_without_a_scale_are_not_trusted_in_metres():
+    row = {"object": "head", "status": "registered", "unit": "scene units", "scale_sd_log": 0.011}
+    assert object_facts(row)["Scale"] == "Trust it to 1.1 % (standard deviation), beside the scene's, not in metres"
 
 
 def test_a_project_is_called_by_its_folder_and_its_objects(tmp_path, monkeypatch):
