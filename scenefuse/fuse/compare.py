@@ -16,8 +16,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, spacing, within
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.measure import RESOLUTION, Measured
-from scenefuse.geometry.depth_test import CELL_SPACINGS, see
-from scenefuse.geometry.photo_check import MIN_AGREEING
+from scenefuse.geometry.depth_test import CELL_SPACINGS, MIN_AGREEING, see
 from scenefuse.photos.workspace import View
 
 Mask = NDArray[np.bool_]

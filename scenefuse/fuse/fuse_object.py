@@ -10,7 +10,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.cloud.tiled_cloud import Rows, open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, read_json, threads, value, write_json
-from scenefuse.core.transforms import Array, Sim3, box_around
+from scenefuse.core.transforms import Array, Sim3, Uncertainty, box_around
 from scenefuse.fuse.compare import REASONS
 from scenefuse.fuse.measure import Evidence, deviations_of_pose, unchecked
 from scenefuse.fuse.modes import (
@@ -26,7 +26,6 @@ from scenefuse.fuse.write import Source, as_bytes, frame_ledger, together, with_
 from scenefuse.geometry.photo_check import Photos, moved_photos, pack, read_photos
 from scenefuse.photos.geodesy import frame_notes, length_unit
 from scenefuse.photos.workspace import read_workspace
-from scenefuse.register.uncertainty import Uncertainty
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from scenefuse.core.stage import threads
 from scenefuse.core.transforms import UP, Array, look_at
 from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, THROUGH_SHARE
 from scenefuse.fuse.measure import NEAR, RESOLUTION
-from scenefuse.geometry.depth_test import see, shown_in
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MIN_AGREEING, Photos, match_in
+from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS, MIN_AGREEING, see, shown_in
+from scenefuse.geometry.photo_check import Photos, match_in
 from scenefuse.geometry.photo_kernel import GOOD_ANGLE
 from scenefuse.geometry.visual_hull import MAX_WRONG_SHARE, Outline, count_silhouettes
 from scenefuse.photos.workspace import View

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, sampled_rows, spacing, within
 from scenefuse.cloud.tiled_cloud import Rows
 from scenefuse.core.stage import setting, threads
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import Array, Sim3, Uncertainty
 from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, Reason, compare, gaps
 from scenefuse.fuse.measure import (
     FIELDS,
@@ -30,7 +30,6 @@ from scenefuse.fuse.measure import (
 from scenefuse.fuse.settle import settle
 from scenefuse.fuse.write import GAINS, MIN_PAIRS, SEAM_SPACINGS, Changes, feathered, with_colors_of
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, moved_photos
-from scenefuse.register.uncertainty import Uncertainty
 
 # Points of the scene around an object that are checked; of a denser scene a random choice, which the others follow.
 MAX_CHECKED = 1_000_000

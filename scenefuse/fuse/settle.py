@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import Sim3, Uncertainty
 from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.fuse.measure import RESOLUTION
 from scenefuse.geometry.icp import ScaleRange, change_between, refine_planes
@@ -14,7 +14,6 @@ from scenefuse.geometry.surface import SAMPLED_POINTS, SCORE_FRACTION, Surface, 
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.likelihood import PIECES_ACROSS
 from scenefuse.register.score import DISTINCT_SCALE_LOG
-from scenefuse.register.uncertainty import Uncertainty
 
 # An object that moves by more than this share of its diagonal was put at a wrong place, however certain that seemed. If
 # the poses of halves spread by more, the scale stays: a roof alone does not determine how large a house is.

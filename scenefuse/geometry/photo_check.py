@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS, MAX_PHOTOS
-from scenefuse.geometry.depth_test import MIN_AGREEING as MIN_AGREEING
 from scenefuse.photos.pictures import NOISE
 from scenefuse.photos.workspace import View, Workspace
 

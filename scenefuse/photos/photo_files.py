@@ -25,24 +25,11 @@ SUFFIXES = (*JPEG, ".png", ".tif", ".tiff", ".bmp", ".ppm")
 FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "BMP", "PPM")
 VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts"}
 # Photos all the same, but in formats that not every stage can decode.
-UNREADABLE = {
-    ".heic",
-    ".heif",
-    ".hif",
-    ".avif",
-    ".jxl",
-    ".webp",
-    ".jp2",
-    ".j2k",
-    ".jpx",
-    ".gif",
-    ".tga",
-    ".dib",
-    ".pgm",
-}
-UNREADABLE |= {".pnm", ".mpo", ".insp", ".dng", ".raw", ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".gpr", ".iiq"}
-UNREADABLE |= {".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f", ".rwl", ".sr2", ".mef", ".mrw"}
-UNREADABLE |= {".erf", ".kdc", ".dcr", ".fff"}
+UNREADABLE = {".heic", ".heif", ".hif", ".avif", ".jxl", ".webp", ".jp2", ".j2k", ".jpx", ".gif", ".tga", ".dib"}
+UNREADABLE |= {".pgm", ".pnm", ".mpo", ".insp", ".dng", ".raw", ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".gpr"}
+UNREADABLE |= {".iiq", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f", ".rwl", ".sr2", ".mef"}
+UNREADABLE |= {".mrw", ".erf", ".kdc", ".dcr", ".fff"}
+
 
 # Phones' photos have 200 million pixels. A small file that claims more would fill the memory.
 MAX_PIXELS = 250_000_000

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import setting
-from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
+from scenefuse.core.transforms import Array, Sim3, Uncertainty, rotation_angle_deg
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface, ends_of
 from scenefuse.georef.placement import MAX_BENT
 from scenefuse.register.problem import Problem
@@ -22,7 +22,6 @@ from scenefuse.register.score import (
     lead,
     pair,
 )
-from scenefuse.register.uncertainty import Uncertainty
 
 DecidedBy = Literal["geometry", "near", "photos", "both"]
 
