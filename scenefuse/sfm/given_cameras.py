@@ -4,6 +4,7 @@ import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -11,13 +12,15 @@ import pycolmap
 from scenefuse.core.stage import StageError, scratch_directory
 from scenefuse.photos.cameras.given import PosedPhoto, at_size, possible_turns
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
+from scenefuse.photos.frames import original_sizes
+from scenefuse.photos.photos import orientations_in
 from scenefuse.sfm.colmap import STRONG_PAIR, cancellable
 
 
 def triangulated(
     cameras: Path,
     folder: Path,
-    orientations: Mapping[str, int],
+    content: dict[str, Any],
     database: Path,
     work: Path,
     options: pycolmap.IncrementalPipelineOptions,
@@ -29,7 +32,7 @@ def triangulated(
         cameras: a COLMAP model, nerfstudio's transforms.json, or OpenSfM's reconstruction.json, or a folder with one;
             Metashape's XML; Bundler's .out with its list.
         folder: of the photos, upright.
-        orientations: EXIF orientation of the photos that were turned for that, by name.
+        content: of photos.json: how EXIF turned these photos for that, and how large they were.
         database: COLMAP database with verified matches.
         work: folder for files in between; it is removed again.
         options: COLMAP's, of triangulation.
@@ -38,11 +41,12 @@ def triangulated(
         StageError: what the readers say; cameras of no photo, or of other shape than their photos; photos that share a
             camera in the database but not here; cameras that do not fit the photos.
     """
-    given, _, notes = read_posed_photos(cameras, folder)
+    root, originals, orientations = Path(os.path.abspath(folder)), original_sizes(content), orientations_in(content)
+    given, _, notes = read_posed_photos(cameras, folder, lambda file: originals[file.relative_to(root).as_posix()])
     with pycolmap.Database.open(database) as opened:
         own = {camera.camera_id: (camera.width, camera.height) for camera in opened.read_all_cameras()}
         sizes = {image.name: own[image.camera_id] for image in opened.read_all_images()}
-    paths = {photo.file.relative_to(os.path.abspath(folder)).as_posix(): photo for photo in given}
+    paths = {photo.file.relative_to(root).as_posix(): photo for photo in given}
     posed = {name: photo for name, photo in paths.items() if name in sizes}
     ways = possible_turns(posed, orientations, sizes)
     models = [_model(way, cameras, folder, database, work, options) for way in ways]

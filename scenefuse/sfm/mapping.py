@@ -26,7 +26,7 @@ from scenefuse.core.stage import (
 from scenefuse.marks.triangulation import read_lengths
 from scenefuse.photos.cameras.read_cameras import place_of
 from scenefuse.photos.frames import original_sizes
-from scenefuse.photos.photos import orientations_in, read_photos
+from scenefuse.photos.photos import read_photos
 from scenefuse.sfm.colmap import (
     ADJUSTMENT_TOLERANCE,
     ITERATIONS,
@@ -118,7 +118,7 @@ def map_photos(
     require_database(database)
     job = Job([p.name for p in read_photos(photos)], folder, database, sparse, settings.min_registered_share)
     if cameras is not None:
-        model, content = _taken(job, cameras, orientations_in(read_json(photos)), seed)
+        model, content = _taken(job, cameras, read_json(photos), seed)
     else:
         model, content = _mapped(job, calibrated, seed)
     content |= in_metres(model, lengths, original_sizes(read_json(photos)))
@@ -236,12 +236,12 @@ def _doubt(doubtful: dict[str, float]) -> str:
 
 
 def _taken(
-    job: Job, cameras: Path, orientations: Mapping[str, int], seed: int
+    job: Job, cameras: Path, photos: dict[str, Any], seed: int
 ) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
     """The same from given cameras."""
     work, place = job.sparse.with_name(f"{job.sparse.name}-given"), place_of(cameras)
     options = _mapper_options(job, True, seed)
-    model, turned = triangulated(cameras, job.folder, orientations, job.database, work, options)
+    model, turned = triangulated(cameras, job.folder, photos, job.database, work, options)
     _check_registered([model], job, given=cameras)
     drop_outliers(model)
     summary = _describe(model, job.names, KNOWN)

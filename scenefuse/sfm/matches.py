@@ -107,7 +107,8 @@ def match_features(
         names = {image.image_id: image.name for image in opened.read_all_images()}
         counts = [opened.num_keypoints_for_image(number) for number in names]
         marks = [zlib.crc32(opened.read_keypoints(number).tobytes()) for number in names]
-    with resumed_file(database, settings, seed, pairs, names, marks) as temporary:
+        lenses = [image.camera_id for image in opened.read_all_images()], opened.read_all_cameras()
+    with resumed_file(database, settings, seed, pairs, names, marks, lenses) as temporary:
         if temporary.is_file():
             print("going on with the pairs that a killed run left", flush=True)
         else:

@@ -1,6 +1,7 @@
 """Bad input ends in one clear sentence, a non-zero exit, and no partial output."""
 
 import re
+import shutil
 
 import pytest
 from support.user_project import HEADER, planned
@@ -153,6 +154,16 @@ def test_clicks_that_cannot_be_used_stop_before_anything_runs(project, refused, 
         (project.path / f"{name}.tsv").write_text(f"label\tphoto\tx_px\ty_px\ninside\t{click}\n")
     output = refused("-n", "results/objects/shed/fused.ply")
     assert f"objects.tsv, object 'shed': {column}.tsv" in output and words in output
+
+
+def test_a_click_in_a_photo_that_is_used_since_others_are_copies_is_no_error(project, snakemake):
+    project.photos("close", 4)
+    shutil.copy(project.path / "close/0.jpg", project.path / "close/0 copy.jpg")
+    project.config["object"]["frames"] = {"frame_step": 3}
+    project.scenes, project.objects = "scene\tphotos\n", HEADER + "shed\t\tclose\t\tprompts.tsv\t\n"
+    (project.path / "prompts.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t3.jpg\t20\t20\n")
+    result = snakemake(project.path, "-n", "results/objects/shed/masks.png", config=project.write())
+    assert result.returncode == 0, result.stdout
 
 
 def test_control_points_in_unknown_photos_stop_before_anything_runs(project, refused):

@@ -90,6 +90,21 @@ def test_a_correction_that_the_page_saves_reruns_the_masks_and_what_they_mark(pl
     assert plan(correct) == {"make_masks", "crop_scene"}
 
 
+def test_a_mask_that_lies_among_the_photos_reruns_the_masks_when_it_changes(plan, snakemake):
+    def give(path):
+        for k in range(3):
+            (path / f"close/{k}_mask.png").write_bytes(b"a mask")
+        (path / "objects.tsv").write_text("object\tscene\tphotos\tmasks\nshed\tyard\tclose\tclose\n")
+        done = snakemake(path, "--touch", "--forceall", MASKS, config=path / "mine.yaml")
+        assert done.returncode == 0, done.stdout
+
+    def give_and_change(path):
+        give(path)
+        replace("close/1_mask.png")(path)
+
+    assert "make_masks" not in plan(give) and "make_masks" in plan(give_and_change, place="changed")
+
+
 def test_a_photo_whose_name_holds_braces_is_listed_and_a_change_of_it_is_noticed(plan):
     def add(project):
         shutil.copy(next((project / "flight").glob("*.jpg")), project / "flight/a{1}.jpg")

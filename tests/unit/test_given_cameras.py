@@ -169,6 +169,20 @@ def test_cameras_of_other_programs_are_taken_as_they_are(tmp_path, write):
     assert nearest.max() < 1e-3
 
 
+@pytest.mark.parametrize("write", [bundler, nerfstudio])
+def test_cameras_that_do_not_say_how_large_their_photos_were_are_of_the_originals_of_frames(tmp_path, write):
+    with_database(tmp_path)
+    cameras = write(tmp_path)
+    origin = {name: {"width": 2 * WIDTH, "height": 2 * HEIGHT} for name in FLIGHT.names}
+    write_photos(tmp_path / "photos.json", FLIGHT.photos(), tmp_path, "photos", [], origin=quantity(origin, ""))
+    text = re.sub(rf"\b{FOCAL}", str(2 * FOCAL), cameras.read_text())
+    cameras.write_text(re.sub(r'"(w|h|cx|cy)": [0-9.]+, ', "", text))
+    report, model = mapped(tmp_path, cameras)
+    np.testing.assert_allclose(camera_poses(model)[2], FLIGHT.centres, atol=1e-6)
+    assert next(iter(model.cameras.values())).mean_focal_length() == pytest.approx(FOCAL)
+    assert value(report, "points") > 150 and value(report, "mean_reprojection_error_px") < 0.01
+
+
 @pytest.mark.parametrize("flat", [False, True], ids=["scene", "frames"])
 def test_photos_of_one_name_in_two_folders_have_the_cameras_of_their_paths(tmp_path, flat):
     with_database(tmp_path)

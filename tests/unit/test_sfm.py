@@ -343,6 +343,31 @@ def test_matches_of_other_features_are_not_gone_on_with(capture, tmp_path, monke
         np.testing.assert_array_equal(opened.read_keypoints(first), moved)
 
 
+def test_matches_under_another_calibration_are_not_gone_on_with(capture, tmp_path, monkeypatch):
+    folder, _ = capture
+    photos, features, database = folder / "photos.json", tmp_path / "features.db", tmp_path / "matches.db"
+
+    def run(calibration=None):
+        given = {"folder": folder / "upright", "photos": photos, "features": features, "calibration": calibration}
+        extract_features(**given, settings=FEATURES)
+        match_features(
+            photos=photos, features=features, database=database,
+            matches=tmp_path / "matches.json", settings=PAIRS, seed=0,
+        )  # fmt: skip
+
+    def stopped(*arguments, **options):
+        raise SystemExit(143)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr("scenefuse.sfm.matches.cancellable", stopped)
+        run()
+    (tmp_path / "camera.txt").write_text("1 PINHOLE 240 180 200 200 121 92")
+    run(tmp_path / "camera.txt")
+    with pycolmap.Database.open(database) as opened:
+        (camera,) = opened.read_all_cameras()
+    assert camera.model_name == "PINHOLE" and camera.params.tolist() == [200, 200, 121, 92]
+
+
 def test_photos_that_look_alike_are_found_by_their_features(tmp_path):
     rng = np.random.default_rng(0)
     places = rng.integers(0, 256, (5, 40, 128))

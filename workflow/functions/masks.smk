@@ -1,6 +1,18 @@
 # What masks are made from, and how.
 from scenefuse.masks.algebra import mask_folders
 from scenefuse.masks.sam2_weights import WEIGHTS
+from scenefuse.photos.photo_files import pictures_below
+
+
+@cache
+def masks_in(folder, where):
+    """The pictures in a folder of masks, which may lie among photos; or the folder, where a rule makes it."""
+    pictures = pictures_below(Path(folder)).values()
+    if not pictures and not made_here(folder):
+        refuse(
+            f"{where}: {folder} is no folder with masks; correct its path (relative paths begin at {os.getcwd()})"
+        )
+    return [folder] if made_here(folder) else [str(file) for file in pictures]
 
 
 def kept_masks(wildcards):
@@ -19,9 +31,9 @@ def mask_inputs(wildcards):
     except StageError as error:
         refuse(str(error))
     where = f"object.masks.keep of '{wildcards.object}'"
-    files = [file for folder in folders for file in photos_in(str(folder), where)]
+    files = [file for folder in folders for file in masks_in(str(folder), where)]
     if row.get("masks"):
-        return files + photos_in(
+        return files + masks_in(
             row["masks"], f"{config['objects']}, masks of '{wildcards.object}'"
         )
     if not row.get("prompts"):

@@ -173,10 +173,12 @@ def names_in(folder, where):
     """The photos in a cell's folder, by name; None where it is no folder, or a rule makes it."""
     if not folder or made_here(folder) or not Path(folder).is_dir():
         return None
-    return {
-        Path(file).relative_to(folder).as_posix(): Path(file)
-        for file in photos_in(folder, where)
-    }
+    from scenefuse.photos.photos import distinct_photos
+
+    try:
+        return {name: Path(folder, name) for name in distinct_photos(Path(folder))[0]}
+    except StageError as error:
+        refuse(f"{where}: {error}")
 
 
 @cache

@@ -30,6 +30,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 EVEN = ("f", "k", "k1", "k2", "k3", "k4", "k5", "k6")
 
 Size = tuple[int, int]
+SizeOf = Callable[[Path], Size]
 # Keys of a place in a report.
 NAMES = ("earth_from_given", "earth_is_geocentric", "given_crs")
 
@@ -40,14 +41,14 @@ class GivenCamera:
 
     Attributes:
         name: of its photo.
-        camera: COLMAP's model of its lens, or what gives it for the file of the photo, where its size counts.
+        camera: COLMAP's model of its lens; where the format leaves out the photo's size, by a function that has it.
         object_from_cam: (4, 4) float64 rigid pose, OpenCV axes.
         mask: file of the photo's mask where the format names one.
         held_out: the format keeps the photo for measuring.
     """
 
     name: str
-    camera: pycolmap.Camera | Callable[[Path], pycolmap.Camera]
+    camera: pycolmap.Camera | Callable[[Callable[[], Size]], pycolmap.Camera]
     object_from_cam: NDArray[np.float64]
     mask: Path | None = None
     held_out: bool = False

@@ -14,8 +14,8 @@ from scenefuse.cloud.crs import plane, read_crs
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines, read_text
 from scenefuse.core.transforms import Sim3
-from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, check_crs, colmap_camera, seen_from
-from scenefuse.photos.photo_files import COORDS, HELD_OUT_FILE, files_by_name, stored_size
+from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, Size, check_crs, colmap_camera, seen_from
+from scenefuse.photos.photo_files import COORDS, HELD_OUT_FILE, files_by_name
 
 TRANSFORMS = {"transforms.json": "nerfstudio", "transforms_train.json": "Blender"}
 # What an OpenDroneMap project that lies on the earth has beside it.
@@ -69,7 +69,7 @@ def _masks(names: list[str], file: Path) -> dict[str, Path]:
     return {name: mask for name, mask in found.items() if named[name] in ("", mask.parent.name.casefold())}
 
 
-def _camera(values: dict[str, Any], where: str) -> Callable[[Path], Camera]:
+def _camera(values: dict[str, Any], where: str) -> Callable[[Callable[[], Size]], Camera]:
     """The lens of a frame for its photo; COLMAP's two models hold all coefficients that the JSON may have."""
     model = FISHEYE if values.get("is_fisheye") else values.get("camera_model", "OPENCV")
     if model not in (*PERSPECTIVE, FISHEYE):
@@ -83,8 +83,8 @@ def _camera(values: dict[str, Any], where: str) -> Callable[[Path], Camera]:
     if "fl_x" not in numbers and (model == FISHEYE or "camera_angle_x" not in numbers):
         raise StageError(f"{where}: no focal length; give fl_x (pixels) or camera_angle_x (radians)")
 
-    def camera(photo: Path) -> Camera:
-        width, height = (numbers[side] for side in "wh") if {"w", "h"} <= numbers.keys() else stored_size(photo)
+    def camera(size: Callable[[], Size]) -> Camera:
+        width, height = (numbers[side] for side in "wh") if {"w", "h"} <= numbers.keys() else size()
         across, upwards = (
             numbers.get(f"fl_{axis}") or _focal(side, numbers.get(f"camera_angle_{axis}", 0.0))
             for axis, side in (("x", width), ("y", height))

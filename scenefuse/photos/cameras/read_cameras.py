@@ -16,7 +16,17 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines, read_text
 from scenefuse.core.transforms import Array
-from scenefuse.photos.cameras.given import FLIP, GivenCamera, Place, PosedPhoto, colmap_camera, largest, seen_from
+from scenefuse.photos.cameras.given import (
+    FLIP,
+    GivenCamera,
+    Place,
+    PosedPhoto,
+    Size,
+    SizeOf,
+    colmap_camera,
+    largest,
+    seen_from,
+)
 from scenefuse.photos.cameras.json_cameras import TRANSFORMS, opensfm_place, read_opensfm, read_transforms
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
 from scenefuse.photos.photo_files import (
@@ -60,13 +70,16 @@ MAX_SKEW = 1e-3
 Image = tuple[str, int, list[float]]
 
 
-def read_posed_photos(cameras: Path, folder: Path | None) -> tuple[list[PosedPhoto], str, list[str]]:
+def read_posed_photos(
+    cameras: Path, folder: Path | None, size_of: SizeOf = stored_size
+) -> tuple[list[PosedPhoto], str, list[str]]:
     """Photos with their cameras, of a file or of a folder that holds one; the program's name; and notes, of photos that
     are not there for instance.
 
     Args:
         cameras: of any program; of a COLMAP model and JSON in one folder the JSON is read.
         folder: of the photos; None for images/ beside the cameras, or, without it and for JSON, for their own folder.
+        size_of: (width, height) of the photo, by its file, that the program had.
 
     Raises:
         StageError: no known format, cameras that cannot be read, none of whose photos is there, or two of one photo.
@@ -82,7 +95,7 @@ def read_posed_photos(cameras: Path, folder: Path | None) -> tuple[list[PosedPho
     masks = {one.mask for one in given}
     files = files_by_name([one.name for one in given], folder, str(cameras))
     files = {name: file for name, file in files.items() if file not in masks}
-    photos = [_posed(one, files[one.name], str(cameras)) for one in given if one.name in files]
+    photos = [_posed(one, files[one.name], str(cameras), size_of) for one in given if one.name in files]
     missing = [one.name for one in given if one.name not in files]
     if not photos:
         raise StageError(
@@ -174,7 +187,7 @@ def _tried(reader: Callable[[Path], Found], file: Path, program: str) -> Found:
         raise StageError(f"{file} holds no cameras of {program} that can be read ({why}); export them again") from None
 
 
-def _posed(one: GivenCamera, file: Path, where: str) -> PosedPhoto:
+def _posed(one: GivenCamera, file: Path, where: str, size_of: SizeOf) -> PosedPhoto:
     """A given camera with the file of its photo; StageError where its pose is none."""
     pose = one.object_from_cam.copy()
     turn = pose[:3, :3]
@@ -187,7 +200,7 @@ def _posed(one: GivenCamera, file: Path, where: str) -> PosedPhoto:
     left, _, right = np.linalg.svd(turn)
     pose[:3, :3] = left @ right
     try:
-        camera = one.camera if isinstance(one.camera, pycolmap.Camera) else one.camera(file)
+        camera = one.camera if isinstance(one.camera, pycolmap.Camera) else one.camera(lambda: size_of(file))
     except ValueError as error:
         raise StageError(f"{where}: the camera of {one.name}: {error}; correct it") from None
     return PosedPhoto(one.name, file, camera, pose, one.mask, one.held_out)
@@ -213,8 +226,8 @@ def _read_bundler(file: Path) -> list[GivenCamera]:
     return found
 
 
-def _bundler_camera(focal: float, k1: float, k2: float, photo: Path) -> pycolmap.Camera:
-    width, height = stored_size(photo)
+def _bundler_camera(focal: float, k1: float, k2: float, size: Callable[[], Size]) -> pycolmap.Camera:
+    width, height = size()
     return colmap_camera("RADIAL", width, height, [focal, width / 2, height / 2, k1, k2])
 
 
