@@ -203,7 +203,7 @@ def crop_linked(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -
             something else.
     """
     assert inputs.alignment_json is not None
-    pose, other = _alignment(inputs.alignment_json), None
+    pose, other, notes = _alignment(inputs.alignment_json), None, tuple[str, ...]()
     if inputs.cloud is not None:
         mode, source, by = "cloud", inputs.cloud, "the object's own cloud"
         own = without_strays(read_cloud(inputs.cloud).points)
@@ -217,10 +217,11 @@ def crop_linked(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -
         near = scene.near(np.minimum(low, sight.min(0)), np.maximum(high, sight.max(0)))[1]
         votes = vote(near.points, masked, pose, settings.min_votes)
         print(f"{votes.object.sum()} of {len(scene)} scene points by the votes of the masks", flush=True)
-        marks, other = np.concatenate([near.points[votes.object], votes.own]), votes.other
+        marks, other, notes = np.concatenate([near.points[votes.object], votes.own]), votes.other, masked.notes
     cut = crop_cloud(near, marks, UP, settings, other)
     points, clicked = _checked(scene, inputs, settings, cut)
-    cut = replace(cut, notes=[f"marked by {by} through the alignment from shared features", *clicked, *cut.notes])
+    by = f"marked by {by} through the alignment from shared features"
+    cut = replace(cut, notes=[by, *notes, *clicked, *cut.notes])
     _announce(cut, str(source))
     return near, cut, Marks(mode, points)
 

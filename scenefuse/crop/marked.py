@@ -36,7 +36,8 @@ from scenefuse.geometry.visual_hull import MAX_BEYOND_POINTS, least_framing
 from scenefuse.marks.clicks import Clicks
 from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
 from scenefuse.mvs.sparse_depths import MASK_REACH_PX, MIN_SHARED_POINTS
-from scenefuse.photos.workspace import View, read_views, read_workspace, with_mask
+from scenefuse.mvs.stereo_points import FEW_POINTS, with_stereo_points
+from scenefuse.photos.workspace import View, Workspace, read_views, read_workspace, with_mask
 
 # What a click outside lies on is flat where the points around it have at most this surface variation; then it is what
 # lies as near to their plane as points of one part lie to each other.
@@ -223,11 +224,13 @@ class Masked:
 
     Attributes:
         views: with `pixels` True on the mask, grown by MASK_REACH_PX for what they and the similarity err by.
-        own: (K, 3) SfM points on the object, in its frame.
+        own: (K, 3) points on the object, in its frame.
+        notes: on points that are not from SfM.
     """
 
     views: list[View]
     own: Array
+    notes: tuple[str, ...] = ()
 
     def sight(self, scene_from_object: Sim3) -> Array:
         """(K + V, 3) the own points and the cameras in the scene, those too far away moved nearer."""
@@ -266,8 +269,8 @@ def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: floa
 def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
     """At most MAX_PHOTOS of an object's photos, spread evenly, with their masks, and the SfM points on the object.
 
-    An SfM point is on the object when it is inside the mask in `min_share` of the photos that observe it, three or
-    more; strays are left out.
+    A point is on the object when it is inside the mask in `min_share` of the photos that observe it, three or more;
+    strays are left out. Where too few SfM points are, those by coarse stereo count too.
 
     Args:
         workspace: undistorted COLMAP workspace of the object.
@@ -275,32 +278,39 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
         min_share: see `vote`.
 
     Raises:
-        StageError: too few photos have a mask, a mask is not of its photo's size, or too few SfM points lie inside.
+        StageError: too few photos have a mask, a mask is not of its photo's size, or too few points lie inside.
     """
     read = read_workspace(workspace)
-    files = [(masks / f"{Path(view.name).stem}.png", view, seen) for view, seen in zip(read.views, read.seen)]
+    files = [(masks / f"{Path(view.name).stem}.png", view) for view in read.views]
     files = [file for file in files if file[0].is_file()]
     if len(files) < CONFIRMING_PHOTOS:
         raise StageError(
             f"{len(files)} photos of {workspace} have a mask in {masks}, three are needed; rerun the masks"
         )
-    observing, inside = (np.zeros(len(read.points), dtype=np.int32) for _ in range(2))
-    found = []
     chosen = np.unique(np.linspace(0, len(files) - 1, min(MAX_PHOTOS, len(files))).round().astype(int))
-    for path, view, seen in (files[k] for k in chosen):
-        one = _with_grown_mask(view, path)
-        found.append(one)
-        observed = np.unique(seen)
-        rows, pixels, _ = one.visible(read.points[observed])
-        observing[observed[rows]] += 1
-        inside[observed[rows]] += one.pixels[pixels[:, 1], pixels[:, 0]]
-    own = read.points[(observing >= CONFIRMING_PHOTOS) & (inside >= min_share * observing)]
+    found = {files[k][1].name: _with_grown_mask(files[k][1], files[k][0]) for k in chosen}
+    own = _own_points(read, found, min_share)
+    if few := len(own) < MIN_SHARED_POINTS:
+        photos = replace(read, views=[read.rgb(view) for view in read.views])
+        own = _own_points(with_stereo_points(photos), found, min_share)
     if len(own) < MIN_SHARED_POINTS:
         raise StageError(
-            f"only {len(own)} SfM points of {workspace} lie inside the masks of {masks},"
+            f"only {len(own)} points of {workspace} lie inside the masks of {masks}, by features and by stereo,"
             f" {MIN_SHARED_POINTS} are needed; look at the masks, and take sharper photos of the object"
         )
-    return Masked(found, without_strays(own))
+    return Masked(list(found.values()), without_strays(own), (FEW_POINTS,) if few else ())
+
+
+def _own_points(photos: Workspace, masked: dict[str, View], min_share: float) -> Array:
+    """(K, 3) points inside the mask of `min_share` of the masked photos that observe them, three or more."""
+    observing, inside = (np.zeros(len(photos.points), dtype=np.int32) for _ in range(2))
+    for view, seen in zip(photos.views, photos.seen):
+        if (one := masked.get(view.name)) is not None:
+            observed = np.unique(seen)
+            rows, pixels, _ = one.visible(photos.points[observed])
+            observing[observed[rows]] += 1
+            inside[observed[rows]] += one.pixels[pixels[:, 1], pixels[:, 0]]
+    return photos.points[(observing >= CONFIRMING_PHOTOS) & (inside >= min_share * observing)]
 
 
 def _with_grown_mask(view: View, path: Path) -> View:

@@ -18,6 +18,7 @@ from scenefuse.core.transforms import Array
 from scenefuse.geometry.surface import ends_of
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.sparse_depths import beside_mask, own_points, pair_worth
+from scenefuse.mvs.stereo_points import FEW_POINTS, with_enough_points
 from scenefuse.nerf.rendered_maps import MAP_AGREEMENT, confirm, write_prior
 from scenefuse.photos.views import Views, load_views
 from scenefuse.photos.workspace import View
@@ -62,11 +63,13 @@ def estimate_depth_prior(
         map_agreement: two depths of one place agree within this share of the object's diagonal.
 
     Raises:
-        StageError: no photo with a mask, fewer than three photos, or fewer than eight SfM points on the object.
+        StageError: no photo with a mask, fewer than three photos, or fewer than eight points on the object, those by
+            coarse stereo included.
     """
     start = time.monotonic()
     use_threads(threads())
-    views = load_views(workspace, masks, width_px, hold_out_every)
+    photos = load_views(workspace, masks, width_px, hold_out_every)
+    views = with_enough_points(photos)
     crops = crop_to_object(views, crop_px)
     known = points_on_object(crops.views, STEREO.sources)
     depths = np.zeros(views.masks.shape, np.float32)
@@ -76,6 +79,8 @@ def estimate_depth_prior(
     with atomic_directory(stage) as folder:
         write_prior(folder, views, prior)
     content = {"photos": quantity(len(views.names), "1"), **shares}
+    if views is not photos:
+        content["fallback"] = quantity(FEW_POINTS, "")
     write_json(report, content | {"seconds": quantity(round(time.monotonic() - start, 1), "s")})
     print(f"depth maps written: {value(content, 'confirmed_share'):.0%} of the object confirmed by other views")
 
@@ -193,7 +198,7 @@ def points_on_object(views: Views, sources: int) -> ObjectPoints:
     on_object = np.unique(np.concatenate(ids))
     if len(on_object) < 8:
         raise StageError(
-            f"only {len(on_object)} SfM points lie on the object in all photos; depth needs at least 8: "
+            f"only {len(on_object)} points lie on the object in all photos; depth needs at least 8: "
             "check that the masks show the object, and that the photos are sharp"
         )
     closest, farthest = ends_of(np.concatenate([place[:, 2] for place in pixels]))

@@ -1,17 +1,22 @@
-"""Parts of the object in masks that points of coarse stereo find."""
+"""Points of coarse stereo: parts of the object in masks, and objects with hardly a feature."""
 
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from support.photographed_plane import BLANK, photographs
+from support.textured_plane import plane_views, speckled
 
+from scenefuse.core.stage import StageError
+from scenefuse.crop import marked
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.propagation import NO_CLICKS, propagate
-from scenefuse.masks.segmentation import with_stereo_points
 from scenefuse.masks.votes import known_points, voter_of
+from scenefuse.mvs.sparse_depths import own_points
+from scenefuse.mvs.stereo_points import FEW_POINTS, with_enough_points, with_stereo_points
 from scenefuse.photos.workspace import Workspace
 
 
@@ -94,3 +99,44 @@ def test_a_part_without_features_is_found_by_stereo_though_the_network_is_surer_
     assert mask_iou(found.masks[1], disc(few.views[1])) < 0.8
     found = propagate(segment, with_stereo_points(few), told, 2)
     assert all(mask_iou(m, disc(v)) > 0.99 for m, v in zip(found.masks, few.views))
+
+
+def test_an_object_with_hardly_a_feature_gets_points_by_stereo_and_any_other_keeps_its_own():
+    views = speckled(*plane_views(width=128, height=96, held_out=0))
+    assert with_enough_points(views) is views
+    bare = views.sparse[:, 0] > 0
+    off = replace(views, tracks=[np.flatnonzero(~bare)] * len(views.names))
+    right = [view.project(views.sparse[bare])[0][:, 0].min() for view in map(views.view, range(len(views.names)))]
+    for matte, column in zip(off.mattes, right):
+        matte[:, : int(column)] = 0
+    assert own_points(off).sum() < 8
+    more = with_enough_points(off)
+    found = more.sparse[own_points(more)]
+    assert len(found) > 100 and (found[:, 0] > -0.1).mean() > 0.95
+    assert np.median(np.abs(found[:, 2] - 3 - 0.3 * found[:, 0])) < 0.02
+
+
+@pytest.fixture
+def bare(plane, tmp_path, monkeypatch):
+    """A workspace of the plane, and masks of a disc on it with no sparse point."""
+    (tmp_path / "images").mkdir(), (tmp_path / "masks").mkdir()
+    for view in plane.views:
+        cv2.imwrite(str(tmp_path / "images" / view.name), view.pixels)
+        there = np.linalg.norm(places_of(view)[..., :2] - [0, 1], axis=2) < 0.6
+        cv2.imwrite(str(tmp_path / "masks" / view.name), np.uint8(255 * there))
+    photos = replace(plane, folder=tmp_path, views=[replace(view, pixels=None) for view in plane.views])
+    monkeypatch.setattr(marked, "read_workspace", lambda folder: photos)
+    return tmp_path
+
+
+def test_masks_without_sparse_points_mark_the_object_by_points_of_stereo_and_say_so(bare):
+    found = marked.read_masked_views(bare, bare / "masks", 0.8)
+    assert found.notes == (FEW_POINTS,) and len(found.own) > 50
+    assert np.linalg.norm(found.own - [0, 1, 0], axis=1).max() < 0.75
+
+
+def test_where_stereo_finds_nothing_either_the_error_says_so(bare):
+    for path in (bare / "images").iterdir():
+        cv2.imwrite(str(path), np.full((160, 160), 128, np.uint8))
+    with pytest.raises(StageError, match="only 0 points of .* by features and by stereo, 8 are needed"):
+        marked.read_masked_views(bare, bare / "masks", 0.8)
