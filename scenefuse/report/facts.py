@@ -46,7 +46,7 @@ def object_facts(row: Row) -> dict[str, str]:
     why = has.get("reason") if status == "unregistered" else has.get("error")
     if status in DONE:
         why = WORDS["decided_by"].get(has.get("decided_by", ""))
-    facts["Result"] = WORDS["results"][status] + (f": {why}" if why else "")
+    facts["Result"] = WORDS["results"][status] + _completed(has) + (f": {why}" if why else "")
     if status == "unregistered":
         facts["Result"] += ". Perhaps it is not in this scene, or too little of it"
     if "height" in has:
@@ -74,6 +74,18 @@ def object_facts(row: Row) -> dict[str, str]:
     elif status == ALONE:
         facts["File"] = f"{folder}/object.ply (a frame of its own, {_plural(unit)})"
     return _capital(facts | _next(has))
+
+
+def verdict(row: Row) -> str:
+    """What became of an object in a word or two."""
+    has = _known(row)
+    return WORDS["badges"].get(has["status"], has["status"]) + _completed(has)
+
+
+def _completed(has: dict[str, Any]) -> str:
+    """How much of an object's surface is there, to follow the word "completed"."""
+    known = has["status"] == "registered" and "surface_missing" in has
+    return f" to {percent(1 - has['surface_missing'])}" if known else ""
 
 
 def scale_sd(row: Row) -> float:

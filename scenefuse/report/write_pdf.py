@@ -13,8 +13,8 @@ from PIL import Image
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.version import VERSION
 from scenefuse.photos.sheets import round_below
-from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scene_facts, surface_facts, title_of
-from scenefuse.report.values import WORDS, length
+from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scene_facts, surface_facts, title_of, verdict
+from scenefuse.report.values import length
 from scenefuse.surface.gltf import metres_per_unit
 
 GAP_MM = 4
@@ -41,9 +41,8 @@ def write_pdf(
         page.text_line(f"Scene {row['scene']}", 12)
         page.facts(scene_facts(row))
     page.text_line("Objects", 12)
-    verdicts = [WORDS["badges"].get(row["status"], row["status"]) for row in rows]
     found = [[each.get("Size", "-"), shorten(each.get("Surface", each["Result"]).split(";")[0], 150)] for each in facts]
-    page.rows([[f.name, verdict, *more] for f, verdict, more in zip(objects, verdicts, found)], (3, 3, 7, 12))
+    page.rows([[folder.name, verdict(row), *more] for folder, row, more in zip(objects, rows, found)], (3, 3, 7, 12))
     for folder in scenes:
         page.pictures([folder / "scene.png"], [f"scene {folder.name}, its cameras and their errors"])
     for folder, row, each in zip(objects, rows, facts):

@@ -11,10 +11,20 @@ import pandas as pd
 import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scale_sd, scene_facts, surface_facts, title_of
+from scenefuse.report.facts import (
+    ADDED,
+    made_by,
+    object_facts,
+    rows_of,
+    scale_sd,
+    scene_facts,
+    surface_facts,
+    title_of,
+    verdict,
+)
 from scenefuse.report.page import document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
-from scenefuse.report.values import WORDS, asset, number, read_table
+from scenefuse.report.values import asset, number, read_table
 from scenefuse.report.view import View, read_view, thin
 from scenefuse.report.view_mesh import read_mesh
 
@@ -131,10 +141,8 @@ def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str
 
 
 def _badge(row: Row) -> str:
-    """What became of an object in a word or two."""
-    status = row["status"]
-    kind = "ok" if status in ("registered", ALONE) else "no"
-    return f'<span class="badge {kind}">{WORDS["badges"].get(status, status)}</span>'
+    kind = "ok" if row["status"] in ("registered", ALONE) else "no"
+    return f'<span class="badge {kind}">{verdict(row)}</span>'
 
 
 def _slider(figures: Path) -> str:

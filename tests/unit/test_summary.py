@@ -609,6 +609,11 @@ def test_lengths_of_an_object_in_a_scene_without_a_scale_are_not_trusted_in_metr
     assert object_facts(row)["Scale"] == "Trust it to 1.1 % (standard deviation), beside the scene's, not in metres"
 
 
+def test_what_is_completed_in_part_alone_is_not_called_completed():
+    row = {"object": "house", "status": "registered", "surface_missing": 0.913, "surface_never_seen": 0.913}
+    assert object_facts(row)["Result"] == "Found in the scene and completed to 8.7 %"
+
+
 def test_a_project_is_called_by_its_folder_and_its_objects(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert title_of([tmp_path / "house", tmp_path / "shed"]) == f"{tmp_path.name}: house, shed"
