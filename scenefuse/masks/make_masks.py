@@ -1,9 +1,11 @@
 """Masks of the object in every photo: by GrabCut or SAM 2 from prompts, or those that a person supplies for the
 original photos, moved into the undistorted ones; what of them `keep` keeps; all checked by their visual hull."""
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import cv2
@@ -32,8 +34,10 @@ from scenefuse.masks.segmentation import MaskSettings, Prompted, ScoredMasks, ma
 from scenefuse.masks.target import target_from_points
 from scenefuse.masks.votes import points_in_masks
 from scenefuse.mvs.undistort import undistort_picture
+from scenefuse.photos.cameras.given import QUARTERS
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.photo_files import masks_by_name, no_match
+from scenefuse.photos.photos import orientations_in
 from scenefuse.photos.pictures import read_supplied_mask, write_picture
 from scenefuse.photos.workspace import View, Workspace, read_cameras, read_workspace
 
@@ -153,7 +157,7 @@ def _make(
             " part of the object, or hold more than it; look at them, and click in a photo where they are wrong"
         )
         found = replace(found, notes=(*found.notes, note))
-    made = _kept(scored, settings.keep, inputs.sparse, photos.views)
+    made = _kept(scored, settings.keep, inputs, photos.views)
     return replace(made, dropped=unusable | made.dropped), found, by
 
 
@@ -195,7 +199,8 @@ def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Worksp
     """Supplied masks (H, W), the photos they belong to, and why the other photos have none."""
     if inputs.supplied is None:
         raise StageError("method supplied needs a folder of masks; set its path in config/objects.tsv")
-    found, unusable = supplied_masks(inputs.supplied, inputs.sparse, photos.views)
+    turned = orientations_in(read_json(inputs.photos_json))
+    found, unusable = supplied_masks(inputs.supplied, inputs.sparse, photos.views, turned)
     # Their whole border is white, and their middle is not.
     holes = [m[[0, -1]].all() and m[:, [0, -1]].all() and not m[len(m) // 2, m.shape[1] // 2] for m in found.values()]
     if 2 * sum(map(bool, holes)) > len(holes):
@@ -205,11 +210,12 @@ def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Worksp
     return [found[view.name] for view in photos.views], photos, missing | unusable
 
 
-def _kept(made: ScoredMasks, keep: str, sparse: Path, views: list[View]) -> ScoredMasks:
+def _kept(made: ScoredMasks, keep: str, inputs: MaskInputs, views: list[View]) -> ScoredMasks:
     """The part of the masks that an expression keeps; their agreement stays that of the whole object."""
     masks, dropped, others = {}, dict(made.dropped), {}
     for folder in mask_folders(keep):
-        others[folder], unusable = supplied_masks(folder, sparse, views)
+        turned = orientations_in(read_json(inputs.photos_json))
+        others[folder], unusable = supplied_masks(folder, inputs.sparse, views, turned)
         dropped = unusable | dropped
     for name, mask in made.masks.items():
         here = {folder: found[name] for folder, found in others.items() if name in found}
@@ -264,7 +270,9 @@ def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str], se
     }
 
 
-def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[str, Mask], dict[str, str]]:
+def supplied_masks(
+    folder: Path, sparse: Path, views: list[View], turned: Mapping[str, int] = MappingProxyType({})
+) -> tuple[dict[str, Mask], dict[str, str]]:
     """Masks from a folder by the name of the photo they belong to, undistorted like it; and why others are unusable.
 
     Args:
@@ -272,6 +280,7 @@ def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[
             or smaller than its photo.
         sparse: COLMAP model of the original photos, before undistortion.
         views: the undistorted photos.
+        turned: EXIF orientation of the photos that were stood upright: their masks may still lie as they are stored.
 
     Raises:
         StageError: no such folder, masks that belong to none of the photos, or none that is usable.
@@ -289,8 +298,9 @@ def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[
             continue
         try:
             camera = originals[view.name]
-            mask = read_supplied_mask(file, (camera.width, camera.height)).astype(np.float32)
-            masks[view.name] = undistort_picture(mask, camera, view) > 0.5
+            quarters = QUARTERS.get(turned.get(view.name, 1), 0)
+            mask = read_supplied_mask(file, (camera.width, camera.height), quarters)
+            masks[view.name] = undistort_picture(mask.astype(np.float32), camera, view) > 0.5
         except StageError as error:
             unusable[view.name] = str(error)
     if not masks and unusable:

@@ -60,8 +60,9 @@ def matte_of(picture: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(channel > top / 2)
 
 
-def read_supplied_mask(file: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """A mask (H, W), of any size, of a photo of this (width, height).
+def read_supplied_mask(file: Path, size: tuple[int, int], quarters: int = 0) -> NDArray[np.bool_]:
+    """A mask (H, W), of any size, of a photo of this (width, height); turned by these clockwise quarters, as its photo
+    was, where it has the shape of before.
 
     Raises:
         StageError: it cannot be read, or is of another picture.
@@ -72,6 +73,8 @@ def read_supplied_mask(file: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
         raise StageError(
             f"the mask {file} cannot be read ({str(error).split(';')[0]}); export it again as PNG"
         ) from None
+    if quarters % 2 and same_shape(mask.shape, size) and not same_shape(mask.shape, size[::-1]):
+        mask = np.rot90(mask, -quarters)
     (height, width), (photo_width, photo_height) = mask.shape, size
     if not same_shape((width, height), size):
         raise StageError(

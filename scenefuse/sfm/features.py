@@ -5,7 +5,7 @@ As COLMAP's (Schoenberger, Frahm 2016), with the same tests; descriptors are com
 place of all with all, which takes a tenth of the time.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,11 +17,12 @@ import pycolmap
 from numba import njit
 from numpy.typing import NDArray
 
-from scenefuse.core.stage import StageError, resumed_file, setting, threads
+from scenefuse.core.stage import StageError, read_json, resumed_file, setting, threads
 from scenefuse.core.tables import read_lines
-from scenefuse.photos.cameras.given import at_size
+from scenefuse.photos.cameras.given import QUARTERS, at_size, turned
 from scenefuse.photos.cameras.read_cameras import camera_of
-from scenefuse.photos.photos import Photo, check_unchanged, read_photos
+from scenefuse.photos.photos import Photo, check_unchanged, orientations_in, read_photos
+from scenefuse.photos.pictures import same_shape
 from scenefuse.sfm.colmap import cancellable
 
 # Fewer features in a photo than this deserve a note: blur, fog, or a wall without texture.
@@ -60,7 +61,8 @@ def extract_features(
         folder: folder of photos.
         photos: JSON list of them.
         features: output, COLMAP database.
-        calibration: a known camera, in the form of COLMAP's cameras.txt, for all photos; it is held from here on.
+        calibration: a known camera, in the form of COLMAP's cameras.txt, for all photos; it is held from here on, and
+            turned along with photos that EXIF rotates.
         settings: SIFT and camera settings.
 
     Raises:
@@ -71,6 +73,8 @@ def extract_features(
     check_unchanged(folder, listed)
     groups = camera_groups(listed, settings.camera_mode)
     known = None if calibration is None else read_calibration(calibration)
+    quarters = {} if known is None else quarter_turns(known, listed, orientations_in(read_json(photos)))
+    groups = [own for names in groups for k in range(4) if (own := [n for n in names if quarters.get(n, 0) == k])]
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = settings.max_image_size_px
     options.num_threads = threads()
@@ -82,7 +86,9 @@ def extract_features(
         with pycolmap.Database.open(temporary) as opened:
             camera_of_done = {image.name: image.camera_id for image in opened.read_all_images()}
         for names in groups:
-            reader = _reader_options(settings, known, next(p for p in listed if p.name == names[0]))
+            first = next(p for p in listed if p.name == names[0])
+            lens = None if known is None else turned(known, quarters[first.name], first.name)
+            reader = _reader_options(settings, lens, first)
             reader.existing_camera_id = next((camera_of_done[n] for n in names if n in camera_of_done), -1)
             cancellable(
                 pycolmap.extract_features,
@@ -151,6 +157,15 @@ def read_calibration(path: Path) -> pycolmap.Camera:
         return camera_of(lines[0])
     except ValueError as error:
         raise StageError(f"the calibration {path} is no camera of COLMAP ({error}); {form}") from None
+
+
+def quarter_turns(known: pycolmap.Camera, photos: list[Photo], orientations: Mapping[str, int]) -> dict[str, int]:
+    """How many clockwise quarters each photo was turned by, by name, since its known camera was calibrated: none where
+    the shape of one on its side shows that the camera is of upright photos."""
+    turns = {photo.name: QUARTERS.get(orientations.get(photo.name, 1), 0) for photo in photos}
+    own = known.width, known.height
+    upright = any(turns[p.name] % 2 and same_shape(own, (p.width, p.height)) for p in photos)
+    return dict.fromkeys(turns, 0) if upright else turns
 
 
 def _reader_options(

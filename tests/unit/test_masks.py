@@ -221,6 +221,18 @@ def test_bad_supplied_masks_are_left_out_with_their_reason(capture, tmp_path):
     assert [k for k in range(PHOTOS) if frames[k] == (255, 0, 0)] == [1, 4, 6]
 
 
+@pytest.mark.parametrize(("orientation", "quarters"), [(6, 1), (8, 3)])
+def test_masks_of_photos_as_they_are_stored_are_turned_with_these(capture, tmp_path, orientation, quarters):
+    shutil.copytree(capture, tmp_path / "capture")
+    turned = {f"f{k}.png": orientation for k in (0, 3, 5)}
+    write_json(tmp_path / "capture/photos.json", {"photos": [], "turned": {"value": turned, "unit": ""}})
+    for name in turned:
+        file = tmp_path / f"capture/truth/{Path(name).stem}_mask.png"
+        cv2.imwrite(str(file), np.rot90(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), quarters))
+    run_stage(tmp_path / "capture", tmp_path, method="supplied", prompts=None, supplied=tmp_path / "capture/truth")
+    assert min(iou_with_truth(capture, tmp_path)) > 0.999
+
+
 def test_the_one_mask_that_disagrees_with_the_visual_hull_is_left_out_and_no_other(capture, tmp_path):
     supplied = tmp_path / "supplied"
     shutil.copytree(capture / "truth", supplied)

@@ -466,6 +466,30 @@ def test_a_portrait_photo_of_a_scene_has_a_portrait_camera(tmp_path):
         assert {(c.width, c.height) for c in database.read_all_cameras()} == {(120, 160)}
 
 
+@pytest.mark.parametrize("stored", [True, False])
+def test_a_calibration_is_turned_along_with_photos_that_exif_rotates(tmp_path, stored):
+    (tmp_path / "photos").mkdir()
+    for index, orientation in enumerate((1, 6, 3, 8) if stored else (6, 6, 6)):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        noise = np.random.default_rng(index).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / "photos" / f"{index}.jpg", exif=exif)
+    list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+    (tmp_path / "camera.txt").write_text("1 PINHOLE 160 120 150 151 70 52" if stored else "1 PINHOLE 120 160 9 9 50 70")
+    extract_features(
+        folder=tmp_path / "upright",
+        photos=tmp_path / "photos.json",
+        features=tmp_path / "features.db",
+        calibration=tmp_path / "camera.txt",
+        settings=FEATURES,
+    )
+    with pycolmap.Database.open(tmp_path / "features.db") as opened:
+        found = [opened.read_camera(i.camera_id) for i in sorted(opened.read_all_images(), key=lambda i: i.name)]
+    # Right of the upright photo is what was its lower side: 68 of 120 rows away from where columns begin now.
+    turned = [[150, 151, 70, 52], [151, 150, 68, 70], [150, 151, 90, 68], [151, 150, 52, 90]]
+    assert [c.params.tolist() for c in found] == (turned if stored else [[9, 9, 50, 70]] * 3)
+
+
 LENSES = {
     "OPENCV": [180.0, 182, 118, 92, -0.12, 0.02, 0.001, -0.001],
     "SIMPLE_RADIAL": [190.0, 120, 90, 0.05],

@@ -165,11 +165,17 @@ def stood_upright(photo: PosedPhoto, quarters: int) -> PosedPhoto:
     Raises:
         StageError: its lens has parameters that depend on the axes and that are not known here.
     """
+    pose = photo.object_from_cam @ np.linalg.matrix_power(FROM_STORED.T, quarters)
+    return replace(photo, camera=turned(photo.camera, quarters, photo.file.name), object_from_cam=pose)
+
+
+def turned(lens: pycolmap.Camera, quarters: int, name: str) -> pycolmap.Camera:
+    """A lens after so many clockwise quarter turns of a photo of this name. Errors as of `stood_upright`."""
     for _ in range(quarters):
-        camera, old = pycolmap.Camera(photo.camera.todict()), photo.camera
-        names = [name.strip() for name in old.params_info.split(",")]
+        camera, old = pycolmap.Camera(lens.todict()), lens
+        names = [word.strip() for word in old.params_info.split(",")]
         own = dict(zip(names, np.asarray(old.params).tolist()))
-        new = {name: own[name] for name in names if name in EVEN}
+        new = {word: own[word] for word in names if word in EVEN}
         new |= {"cx": old.height - own["cy"], "cy": own["cx"]}
         if "fx" in own:
             new |= {"fx": own["fy"], "fy": own["fx"]}
@@ -177,13 +183,13 @@ def stood_upright(photo: PosedPhoto, quarters: int) -> PosedPhoto:
             new |= {"p1": own["p2"], "p2": -own["p1"]}
         if set(new) != set(own):
             raise StageError(
-                f"{photo.file.name} is rotated by EXIF, and its camera, a {old.model.name}, cannot be turned along;"
+                f"{name} is rotated by EXIF, and its camera, a {old.model.name}, cannot be turned along;"
                 " undistort the photos in the program that found the cameras, or rotate them before"
             )
         camera.width, camera.height = old.height, old.width
-        camera.params = [new[name] for name in names]
-        photo = replace(photo, camera=camera, object_from_cam=photo.object_from_cam @ FROM_STORED.T)
-    return photo
+        camera.params = [new[word] for word in names]
+        lens = camera
+    return lens
 
 
 @dataclass(frozen=True)
