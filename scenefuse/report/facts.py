@@ -50,7 +50,7 @@ def object_facts(row: Row) -> dict[str, str]:
     if status == "unregistered":
         facts["Result"] += ". Perhaps it is not in this scene, or too little of it"
     if "height" in has:
-        sides = " × ".join(length(has[side], unit) for side in ("length", "width"))
+        sides = " × ".join(length(has[side], unit) for side in ("length", "width")).replace(" scene units ×", " ×")
         facts["Size"] = f"{sides}, {length(has['height'], unit)} high"
     if "surface_missing" in has:
         lacks = {what: has.get(f"surface_{name}", 0.0) for name, what in WORDS["missing"].items()}

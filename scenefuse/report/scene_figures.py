@@ -123,7 +123,7 @@ def _draw_errors(axes: Any, camera: Camera, centres: dict[str, Array], errors: p
     errors = errors[errors.kind == "position"].dropna(subset=["east_m", "north_m"]) if len(errors) else errors
     errors = errors[errors.name.isin(centres)] if len(errors) else errors
     if errors.empty:
-        axes.set_title("no positions by GPS to compare with")
+        axes.set_title("no positions by GPS to compare with", fontsize="medium", pad=3)
         return
     pixels = camera.project(np.array([centres[name] for name in errors.name]))[0]
     sides = errors[["east_m", "north_m"]].abs().to_numpy()
