@@ -1,4 +1,4 @@
-"""`scenefuse complete`: from folders of photos to the completed scene; the same command again goes on."""
+"""`scenefuse complete`: from photos or videos to the completed scene; the same command again goes on."""
 
 import contextlib
 import fcntl
@@ -53,8 +53,8 @@ def complete(
     workflow, and opens the report. The same command again goes on where it was left.
 
     Args:
-        flight: photos of the scene (a folder), or its cloud.
-        house: close-up photos of an object in it (a folder or a video), or its cloud.
+        flight: photos of the scene (a folder or a video), or its cloud.
+        house: close-up photos of an object in it, likewise.
         others: the same of more objects.
         out: folder of the project; where it is left out, FLIGHT_completed.
         prompts: tables of clicks, one for each object in its order, in place of the page.

@@ -40,8 +40,8 @@ def init(
 
     Args:
         folder: of the project; it may exist, but not hold a project.
-        scene: photos of the scene (a folder), or its cloud, for the first row of scenes.tsv.
-        objects: the same of objects in it (a folder or a video, or a cloud), for the rows of objects.tsv.
+        scene: photos of the scene (a folder or a video), or its cloud, for the first row of scenes.tsv.
+        objects: the same of objects in it, for the rows of objects.tsv.
         preset: what config.yaml holds: settings for a first look, the shipped ones, or larger ones for a GPU.
 
     Raises:
@@ -100,10 +100,8 @@ def project_rows(folder: Path, scene: Path | None, objects: Sequence[Path]) -> d
         if inner.is_relative_to(outer):
             raise StageError(f"{inner} lies in {outer}, whose photos in folders below count too; move it elsewhere")
     scene_name = "" if scene is None else default_name(scene)
-    scenes = [] if scene is None else [{"scene": scene_name} | _source(scene, folder, video=False)]
-    rows = [
-        {"object": name, "scene": scene_name} | _source(path, folder, video=True) for name, path in zip(names, objects)
-    ]
+    scenes = [] if scene is None else [{"scene": scene_name} | _source(scene, folder)]
+    rows = [{"object": name, "scene": scene_name} | _source(path, folder) for name, path in zip(names, objects)]
     for row in rows:
         # Where `pick` saves what is clicked.
         row |= {"prompts": f"config/{row['object']}_prompts.tsv"} if "photos" in row else {}
@@ -130,11 +128,10 @@ def _stem(path: Path) -> str:
     return path.stem if path.is_file() else path.resolve().name
 
 
-def _source(path: Path, folder: Path, *, video: bool) -> dict[str, str]:
+def _source(path: Path, folder: Path) -> dict[str, str]:
     """The cell of a row that names photos or a cloud, relative to the project if it lies inside."""
-    wanted = "a folder of photos, a video or a cloud" if video else "a folder of photos or a cloud"
     if not path.exists():
-        raise StageError(f"{path} does not exist; give {wanted}")
+        raise StageError(f"{path} does not exist; give a folder of photos, a video or a cloud")
     suffix = path.suffix.lower()
     is_cloud = path.is_file() and suffix in READERS
     if path.is_dir():
@@ -142,8 +139,8 @@ def _source(path: Path, folder: Path, *, video: bool) -> dict[str, str]:
             raise StageError(f"the project {folder} would lie among its photos in {path}; give a folder of its own")
         if (count := len(photo_files(path))) < FIXING_POINTS:
             raise StageError(f"{path} holds {count} {'photo' if count == 1 else 'photos'}; cameras need three or more")
-    elif not (is_cloud or (video and suffix in VIDEO_SUFFIXES)):
-        raise StageError(f"{path} is not {wanted.replace('or a', 'nor a')} ({', '.join(READERS)})")
+    elif not (is_cloud or suffix in VIDEO_SUFFIXES):
+        raise StageError(f"{path} is not a folder of photos, a video nor a cloud ({', '.join(READERS)})")
     elif path.stat().st_size == 0:
         raise StageError(f"{path} is empty; export it again")
     elif suffix in TEXTS:

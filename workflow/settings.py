@@ -28,7 +28,7 @@ from scenefuse.nerf.object_cloud import CloudSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
 from scenefuse.paper.monocular import MonocularSettings
-from scenefuse.photos.frames import FrameSettings
+from scenefuse.photos.frames import FrameSettings, VideoSettings
 from scenefuse.register.decision import FineSettings
 from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.mapping import MappingSettings
@@ -112,6 +112,7 @@ SECTIONS: dict[str, list[Any]] = {
     "demo.flight": [FlightSettings()],
     "demo.orbit": [OrbitSettings()],
     "scene": [ChunkSettings()],
+    "scene.frames": [VideoSettings()],
     "scene.features": [FeatureSettings()],
     "scene.matches": [MatchSettings()],
     "scene.sparse": [MappingSettings()],

@@ -40,7 +40,7 @@ class GeoreferenceSettings:
     """When GPS is used, and how strictly."""
 
     use_gps: bool = setting(True)
-    """Whether GPS positions in EXIF bring the model into metres."""
+    """Whether GPS positions bring the model into metres."""
     gps_accuracy_m: float = setting(3, unit="m", above=0)
     """Standard error of a GPS position; positions farther than four times this from their cameras are outliers."""
 

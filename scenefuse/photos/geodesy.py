@@ -200,4 +200,4 @@ def heights_of(crs: str | None, control_points: int | None, altitude_m: float | 
         return whole.sub_crs_list[1].name
     if control_points:
         return "those of the control points"
-    return "as the photos' GPS gives them (EXIF), which does not say whether above the ellipsoid or the sea"
+    return "as the photos' GPS gives them, which does not say whether above the ellipsoid or the sea"

@@ -127,8 +127,9 @@ def photo_files(folder: Path) -> list[Path]:
             " EXIF data kept, or take them out of the folder"
         )
     if not photos:
-        video = next((file for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)
-        found = f"as an object, give the video itself: {video}" if video else f"{len(files)} other files were found"
+        videos = [str(file) for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
+        found = f"{len(files)} other files were found"
+        found = f"or give a video itself: {', '.join(videos[:3])}" if videos else found
         raise StageError(f"the photo folder {folder} holds no photos; put JPEG, PNG, TIFF or BMP files there ({found})")
     beside = {folder / name for name in beside_photos(folder)}
     return sorted({*photos} - beside, key=lambda file: file.relative_to(folder).as_posix())
@@ -137,6 +138,13 @@ def photo_files(folder: Path) -> list[Path]:
 def geo_file(folder: Path) -> Path | None:
     """The positions of a folder's photos, in the file that OpenDroneMap calls geo.txt, if there is one."""
     return min(folder.glob("[Gg][Ee][Oo].[Tt][Xx][Tt]"), default=None)
+
+
+def subtitles(video: Path) -> Path | None:
+    """The subtitles beside a video, in which drones write their positions, if there are any."""
+    name = video.with_suffix(".srt").name.casefold()
+    beside = video.parent.iterdir() if video.suffix.lower() in VIDEO_SUFFIXES and video.is_file() else ()
+    return next((path for path in beside if path.name.casefold() == name), None)
 
 
 def pictures_below(folder: Path) -> dict[str, Path]:

@@ -1,6 +1,5 @@
 """Photos as the reconstruction reads them: checked, upright, and what their EXIF says."""
 
-import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -12,10 +11,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
-from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, value, write_json
-from scenefuse.photos.photo_files import FORMATS, JPEG, beside_photos, geo_file, in_folders, open_picture, photo_files
+from scenefuse.core.stage import StageError, quantity, read_json, sha256, threads, value, write_json
+from scenefuse.photos.photo_files import FORMATS, JPEG, beside_photos, in_folders, open_picture, photo_files
 from scenefuse.photos.pictures import JPEG_QUALITY, read_raw, stretched
-from scenefuse.photos.positions import check_order, exif_number, exif_text, positions_of, read_geo, stated_position
+from scenefuse.photos.positions import exif_number, exif_text, stated_position
 
 # SIFT finds next to nothing in photos that use so much fewer bits than their files have: 12 of 16, or the dark 6 of 8.
 MIN_UNUSED_BITS = 2
@@ -35,7 +34,7 @@ class Photo:
         width: columns as stored; as people see them where `orientation` is 1.
         height: rows, likewise.
         sha256: of the file's bytes.
-        latitude_deg: WGS84 latitude from EXIF or geo.txt, or None.
+        latitude_deg: WGS84 latitude from EXIF, geo.txt or a video's subtitles, or None.
         longitude_deg: WGS84 longitude, likewise.
         altitude_m: altitude, likewise.
         focal_px: focal length that EXIF's 35 mm equivalent gives, or None.
@@ -68,47 +67,6 @@ class Photo:
     def has_gps(self) -> bool:
         """Whether a position is known."""
         return self.latitude_deg is not None and self.longitude_deg is not None
-
-
-def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
-    """List the photos of a folder and its subfolders, check that every one can be decoded, and stand them upright.
-
-    Photos that EXIF says are rotated are turned and written again, and so are those of a format that COLMAP does not
-    read, whatever their ending; all others are linked, unless all are dark or use few of their bits: then they are
-    written brighter. From here on pixels count as people see them. A geo.txt in the
-    folder takes the place of the positions in EXIF.
-
-    Args:
-        folder: folder of photos; JPEG, PNG, TIFF or BMP.
-        upright: output, folder of the same names with upright copies of the rotated photos and links to all others.
-        photos: output, JSON with name, size in pixels, SHA-256, position and focal length of each photo in `upright`.
-
-    Raises:
-        StageError: the folder is missing or holds no photo, a photo cannot be decoded, or geo.txt is not well formed.
-    """
-    names, copies = distinct_photos(folder)
-    geo = geo_file(folder)
-    positions = read_geo(geo) if geo else {}
-    stored = each_photo(lambda name: inspect_photo(folder, name), names)
-    bits = bits_to_stretch(stored)
-    with atomic_directory(upright) as temporary:
-        listed = each_photo(lambda photo: _stood_upright(folder, photo, temporary, bits), stored)
-    turned = {p.name: p.orientation for p in stored if p.orientation != 1}
-    if geo:
-        places = positions_of(names, positions, geo)
-        check_order(places, [asdict(photo) for photo in listed], geo)
-        listed = [replace(p, position_note="", **place) for p, place in zip(listed, places)]
-    notes = copies + below_folder(names) + photo_notes(listed, bits)
-    if geo:
-        known = [photo for photo in listed if photo.has_gps]
-        where = f"{known[0].name} at latitude {known[0].latitude_deg:.5f}, longitude {known[0].longitude_deg:.5f}"
-        notes.append(f"{geo.name} gives {len(known)} of {len(listed)} positions ({where}); EXIF's are not used")
-    if turned:
-        first = next(iter(turned))
-        notes.append(f"{len(turned)} photos ({first}, ...) carry an EXIF rotation; upright copies of them are used")
-    with_gps, stated = sum(p.has_gps for p in listed), sum(p.has_gps and bool(p.horizontal_sd_m) for p in listed)
-    print(f"{len(listed)} photos in {folder}, {with_gps} with a GPS position, {stated} with its accuracy", flush=True)
-    write_photos(photos, listed, upright, kind="photos", notes=notes, turned=quantity(turned, ""))
 
 
 def distinct_photos(folder: Path) -> tuple[list[str], list[str]]:
@@ -153,16 +111,6 @@ def bits_to_stretch(photos: list[Photo]) -> int:
     """By how many bits the pixels of all photos are shifted to the left, so that the brightest has all of its bits."""
     unused = min((photo.unused_bits for photo in photos), default=0)
     return unused if unused >= MIN_UNUSED_BITS else 0
-
-
-def _stood_upright(folder: Path, photo: Photo, output: Path, bits: int) -> Photo:
-    """Link or write one photo into `output`; what is listed is the result."""
-    target = output / photo.name
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if stays(folder, photo, bits):
-        target.symlink_to(os.path.relpath(os.path.realpath(folder / photo.name), os.path.realpath(target.parent)))
-        return photo
-    return save_upright(folder, photo, target, bits)
 
 
 def stays(folder: Path, photo: Photo, bits: int) -> bool:

@@ -150,8 +150,14 @@ def _in_photos_of_scene(project: Project, name: str) -> Iterator[Table]:
         return
     results = Path("results/scenes") / scene
     source = Path(project.scenes[scene]["photos"])
-    # Those that the workflow turned upright are the same to a person.
-    pictures = _pictures((photo, source / photo) for photo in distinct_photos(source)[0])
+    if source.is_file():
+        # Objects can be clicked before the scene's frames are there.
+        if project.objects[name].get("photos") and not (results / "photos.json").is_file():
+            return
+        pictures = _video_pictures(source, results, "photos")
+    else:
+        # Those that the workflow turned upright are the same to a person.
+        pictures = _pictures((photo, source / photo) for photo in distinct_photos(source)[0])
     where: dict[str, Any] = {"pictures": pictures, "models": (results / "georeferenced", results / "sparse")}
     made = Path("results/objects") / name / "fused.ply"
     yield Table(project, "objects", name, "fiducials", title="In the scene", result=made, **where)
@@ -170,20 +176,20 @@ def _object_pictures(source: Path, results: Path, frames: dict[str, Any]) -> dic
         StageError: there are no photos, one cannot be read, or a video has no frames yet.
     """
     if source.is_file():
-        return _video_pictures(source, results)
+        return _video_pictures(source, results, "frames")
     names, _ = distinct_photos(source)
     chosen = [names[k] for k in thin_out(len(names), frames["frame_step"], frames["max_frames"])]
     return _pictures((frame_name(name), source / name) for name in chosen)
 
 
-def _video_pictures(video: Path, results: Path) -> dict[str, Picture]:
+def _video_pictures(video: Path, results: Path, folder: str) -> dict[str, Picture]:
     """The frames that were extracted. They may be smaller than the video's, whose pixels clicks are in."""
     listed = results / "photos.json"
     if not listed.is_file():
         raise StageError(f"{video} is a video whose frames are not there yet; run: scenefuse run {listed}")
     found = {}
     for name, origin in read_json(listed)["origin"]["value"].items():
-        path = results / "frames" / name
+        path = results / folder / name
         scale = upright_size(path)[0] / origin["width"]
         found[name] = Picture(name, path, origin["width"], origin["height"], scale)
     return found

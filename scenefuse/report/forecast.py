@@ -1,6 +1,5 @@
 """What a run will take: time, memory and disk space, forecast before its first job."""
 
-import math
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +10,8 @@ import pandas as pd
 from PIL.ExifTags import IFD
 
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.photos.photo_files import open_picture, photo_files, upright_size
+from scenefuse.photos.frames import video_size
+from scenefuse.photos.photo_files import open_picture, photo_files, subtitles, thin_out, upright_size
 from scenefuse.report.values import bytes_in, size_text
 from scenefuse.sfm.matches import MatchSettings
 
@@ -62,8 +62,8 @@ class Photos:
 
     @staticmethod
     def of(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) -> "Photos | None":
-        """Those of a table's row, also those that the demo is yet to render; None for a cloud, a video, and photos that
-        cannot be read."""
+        """Those of a table's row, also those that the demo is yet to render; None for a cloud, and for what cannot be
+        read."""
         if not row.get("photos"):
             return None
         if Path(row["photos"]).is_relative_to("results/demo") and not Path(row["photos"]).exists():
@@ -71,19 +71,21 @@ class Photos:
             count = flight["columns"] * flight["rows"] + flight["obliques"] if kind == "scene" else orbit["views"]
             width = (flight if kind == "scene" else orbit)["width_px"]
             return Photos(count, width, round(0.75 * width), kind == "scene")
+        source, frames = Path(row["photos"]), settings[kind]["frames"]
         try:
-            files = photo_files(Path(row["photos"]))
-            width, height = upright_size(files[0])
-            with open_picture(files[0]) as first:
-                with_gps = bool(first.getexif().get_ifd(IFD.GPSInfo))
+            if source.is_file():
+                count, width, height = video_size(source)
+                with_gps = subtitles(source) is not None
+            else:
+                files = photo_files(source)
+                count, (width, height) = len(files), upright_size(files[0])
+                with open_picture(files[0]) as first:
+                    with_gps = bool(first.getexif().get_ifd(IFD.GPSInfo))
         except StageError:
             return None
-        count = len(files)
-        if kind == "object":
-            frames = settings["object"]["frames"]
-            count = math.ceil(count / frames["frame_step"])
-            count = min(count, frames["max_frames"] or count)
-        return Photos(count, width, height, with_gps)
+        if kind == "object" or source.is_file():
+            count = len(thin_out(count, frames.get("frame_step", 1), frames["max_frames"]))
+        return Photos(count, width, height, with_gps) if count else None
 
 
 def disk_bytes(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) -> int | None:

@@ -42,8 +42,9 @@ from scenefuse.georef.georeference import adjust_georeferenced, camera_poses, ge
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.georef.residuals import rms
 from scenefuse.marks.clicks import Click
+from scenefuse.photos.frames import VideoSettings, list_photos
 from scenefuse.photos.geodesy import LocalFrame
-from scenefuse.photos.photos import Photo, list_photos, read_photos
+from scenefuse.photos.photos import Photo, read_photos
 from scenefuse.photos.workspace import read_model
 from scenefuse.sfm.features import FeatureSettings, extract_features
 from scenefuse.sfm.gravity import estimate_up
@@ -90,7 +91,7 @@ def mapped(photos: Path, work: Path) -> Capture:
     if not (work / "sparse.json").is_file():
         upright = work / "photos"
         features = FeatureSettings(max_features=3000, first_octave=0, camera_mode="auto")
-        list_photos(folder=photos, upright=upright, photos=listed)
+        list_photos(source=photos, upright=upright, photos=listed, settings=VideoSettings())
         extract_features(folder=upright, photos=listed, features=work / "features.db", settings=features)
         match_features(
             photos=listed,

@@ -260,7 +260,7 @@ def link_photos(work: Path, folder: Path, photos: int, strange: int) -> None:
 def match(folder: Path, gps: bool, checkout: Path) -> dict[str, dict[str, float]]:
     """What the steps from photos to matches take."""
     listed, features = folder / "photos.json", folder / "features.db"
-    list_photos = ["scripts/photos/list_photos.py", "--folder", folder / "source", "--upright", folder / "photos"]
+    list_photos = ["scripts/photos/list_photos.py", "--source", folder / "source", "--upright", folder / "photos"]
     spent = {"list": timed(folder, "list_photos", [*list_photos, "--photos", listed], checkout)}
     content = read_json(listed)
     own = [{key: photo[key] for key in PLACE} for photo in content["photos"] if photo["name"].startswith("flight")]

@@ -4,8 +4,9 @@ import os
 import shutil
 
 import pytest
-from support.user_project import CLICKS, Project, planned
+from support.user_project import CLICKS, Project, film, planned
 
+from scenefuse.core.stage import read_json, value
 from scenefuse.marks.clicks import Click
 from scenefuse.pick.document import Document
 
@@ -110,6 +111,25 @@ def test_a_photo_whose_name_holds_braces_is_listed_and_a_change_of_it_is_noticed
         shutil.copy(next((project / "flight").glob("*.jpg")), project / "flight/a{1}.jpg")
 
     assert "list_photos" in plan(add)
+
+
+def test_a_scene_s_video_is_listed_by_a_run_and_its_subtitles_are_inputs(tmp_path, snakemake):
+    project, listed = Project(tmp_path), "results/scenes/yard/photos.json"
+    film(tmp_path / "flown.mp4")
+    project.photos("close")
+    for name in ("clicks.tsv", "prompts.tsv"):
+        (tmp_path / name).write_text(CLICKS)
+    project.scenes = "scene\tphotos\nyard\tflown.mp4\n"
+    config = project.write()
+    whole = snakemake(tmp_path, "-n", config=config)
+    assert whole.returncode == 0 and {"list_photos", "georegister", "complete_scene"} <= planned(whole.stdout)
+    made = snakemake(tmp_path, listed, config=config)
+    assert made.returncode == 0, made.stdout
+    content = read_json(tmp_path / listed)
+    assert (value(content, "kind"), value(content, "count"), value(content, "with_gps")) == ("video", 12, 12)
+    assert "Nothing to be done" in snakemake(tmp_path, "-n", listed, config=config).stdout
+    replace("flown.SRT")(tmp_path)
+    assert planned(snakemake(tmp_path, "-n", listed, config=config).stdout) == {"list_photos"}
 
 
 def test_settings_of_a_row_rerun_that_row_only_and_what_reads_it(plan):

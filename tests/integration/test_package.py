@@ -220,7 +220,7 @@ def test_a_settings_file_that_is_not_there_is_one_sentence(tmp_path, option):
         ({"folder": Path("new"), "scene": Path("nowhere")}, "nowhere does not exist"),
         ({"folder": Path("new"), "scene": Path("taken"), "objects": (Path("a/x"), Path("b/x"))}, "two objects"),
         ({"folder": Path("new"), "scene": Path("taken")}, "taken holds no photos"),
-        ({"folder": Path("new"), "scene": Path("walk.mp4")}, "walk.mp4 is not a folder of photos nor a cloud"),
+        ({"folder": Path("new"), "scene": Path("walk.mp4")}, "walk.mp4 is empty; export it again"),
         ({"folder": Path("new"), "objects": (Path("code.py"),)}, "code.py is not a folder of photos, a video nor"),
         ({"folder": Path("new"), "objects": (Path("empty.ply"),)}, "empty.ply is empty"),
         ({"folder": Path("shots/new"), "objects": (Path("shots"),)}, "would lie among its photos in shots"),

@@ -29,6 +29,20 @@ def write_clouds(path: Path) -> None:
     (path / "mine.yaml").write_text(yaml.safe_dump({"scenes": "scenes.tsv", "objects": "objects.tsv"}))
 
 
+def film(path: Path, frames: int = 12, size: tuple[int, int] = (128, 96)) -> Path:
+    """A video of noise, four frames a second, and DJI's subtitles of a flight east beside it; returns its path."""
+    rng, video = np.random.default_rng(0), cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 4.0, size)
+    for _ in range(frames):
+        blocks = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)
+        video.write(cv2.resize(blocks, size, interpolation=cv2.INTER_NEAREST))
+    video.release()
+    times = [f"00:00:{index / 4:06.3f}".replace(".", ",") for index in range(frames + 1)]
+    stated = (f"[latitude: 47.5] [longitude: {8 + k / 1e4:.6f}] [rel_alt: 9 abs_alt: {400 + k}]" for k in range(frames))
+    shown = zip(range(1, frames + 1), times, times[1:], stated)
+    path.with_suffix(".SRT").write_text("\n".join(f"{k}\n{a} --> {b}\n{text}\n" for k, a, b, text in shown))
+    return path
+
+
 class Project:
     """A working directory of a user's own: the scene yard, and in it the shed."""
 

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.user_project import CLICKS, Project
+from support.user_project import CLICKS, Project, film
 
 from scenefuse import command_line, complete
 from scenefuse.core.settings import read_differences
@@ -142,6 +142,15 @@ def test_what_cannot_be_used_is_one_sentence_before_anything_is_made(two_folders
     assert not list(two_folders.rglob("objects.tsv"))
 
 
+def test_a_scene_may_be_a_video(two_folders, workflow):
+    workflow(SUMMARY.replace("parents=True", "parents=True, exist_ok=True"))
+    film(two_folders / "flown.MP4")
+    for _ in range(2):  # The same command goes on.
+        complete.complete(Path("flown.MP4"), Path("close"), prompts=(Path("clicks.tsv"),))
+    row = read_table(Path("flown_completed/config/scenes.tsv"), "scene")["flown"]
+    assert row["photos"] == str(two_folders / "flown.MP4") and not row["cloud"]
+
+
 def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
     for name in ("empty", "filmed"):
         (two_folders / name).mkdir()
@@ -151,7 +160,7 @@ def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
     Project(two_folders).photos("flight/shed", 4)
     for folder, sentence in (
         ("empty", "the photo folder empty holds no photos"),
-        ("filmed", r"filmed holds no photos; .*\(as an object, give the video itself: filmed/clip.MP4\)"),
+        ("filmed", r"filmed holds no photos; .*\(or give a video itself: filmed/clip.MP4\)"),
         ("notes.txt", r"notes.txt is not a readable TXT cloud \(none of its first lines holds three numbers"),
         ("one", "one holds 1 photo; cameras need three or more"),
         ("flight", "flight is given as the scene and as an object"),

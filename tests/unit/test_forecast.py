@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
+from support.user_project import film
 
 from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import StageError
@@ -56,6 +57,15 @@ def test_a_forecast_counts_the_frames_that_are_used_as_they_are_turned(photos):
     (photos / "a.png").unlink()
     # 200 x 267 pixels of maps in the place of 200 x 150.
     assert disk_bytes("object", row, shipped) > 1 / 3 * thing + 50 * 200 * 117
+
+
+def test_a_forecast_counts_the_frames_that_are_taken_of_a_video(tmp_path):
+    shipped, row = read_settings(None), {"photos": str(film(tmp_path / "film.mp4", 12, (400, 300)))}
+    assert Photos.of("scene", row, shipped) == Photos.of("object", row, shipped) == Photos(12, 400, 300, True)
+    shipped["scene"]["frames"]["max_frames"] = 5
+    assert Photos.of("scene", row, shipped) == Photos(5, 400, 300, True)
+    (tmp_path / "film.mp4").write_bytes(b"no video")
+    assert Photos.of("scene", row, shipped) is None
 
 
 def test_what_cannot_be_told_is_left_to_the_stage_that_needs_it(photos, tmp_path):

@@ -1,14 +1,26 @@
+import struct
+
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from support.user_project import film
 
 from scenefuse.core.stage import StageError, read_json, value
-from scenefuse.photos.frames import FrameSettings, extract_frames, original_sizes, sharpness
+from scenefuse.photos.frames import (
+    FrameSettings,
+    VideoSettings,
+    extract_frames,
+    list_photos,
+    original_sizes,
+    sharpness,
+    video_size,
+)
 from scenefuse.photos.photo_files import thin_out
 from scenefuse.photos.photos import read_photos
 
 SETTINGS = FrameSettings(frame_step=1, max_frames=0, max_width_px=64)
+SHIPPED = VideoSettings()
 
 
 def picture(width=64, height=48, seed=0):
@@ -105,6 +117,64 @@ def test_the_sharpest_frame_of_each_window_of_a_video_is_kept(tmp_path):
     assert chosen == [2, 5, 11, 12]
     assert (photos[0].width, photos[0].height) == (64, 48)
     assert original_sizes(content)[photos[0].name] == (128, 96)
+
+
+def listed(tmp_path, source, settings=SHIPPED):
+    list_photos(source=source, upright=tmp_path / "up", photos=tmp_path / "photos.json", settings=settings)
+    return read_photos(tmp_path / "photos.json"), read_json(tmp_path / "photos.json")
+
+
+def test_a_scene_s_video_gives_frames_of_its_size_with_the_positions_in_its_subtitles(tmp_path):
+    photos, content = listed(tmp_path, film(tmp_path / "DJI_0001.MP4"), VideoSettings(max_frames=6))
+    assert value(content, "kind") == "video" and len(photos) == 6 == value(content, "with_gps")
+    frames = [value(content, "origin")[photo.name]["frame"] for photo in photos]
+    assert frames == sorted(frames) and frames[-1] >= 10
+    for frame, photo in zip(frames, photos):
+        assert (photo.name, photo.width, photo.height) == (f"frame_{frame:06d}.jpg", 128, 96)
+        place = (photo.latitude_deg, photo.longitude_deg, photo.altitude_m)
+        assert place == pytest.approx((47.5, 8 + frame / 1e4, 400 + frame), abs=1e-6)
+        assert (tmp_path / "up" / photo.name).is_file()
+    (note,) = value(content, "notes")
+    assert note.startswith("DJI_0001.SRT gives 6 of 6 positions (the first: latitude 47.50000, longitude 8.00000)")
+
+
+def test_an_object_s_video_has_positions_too_and_without_subtitles_there_are_none(tmp_path):
+    path = film(tmp_path / "orbit.mp4")
+    photos, _ = extract(tmp_path, path)
+    assert all(photo.has_gps for photo in photos) and photos[0].width == 64
+    path.with_suffix(".SRT").write_bytes(b"\x00\xff")
+    photos, content = listed(tmp_path, path)
+    assert len(photos) == 12 and not any(photo.has_gps for photo in photos)
+    assert value(content, "notes") == ["orbit.SRT beside the video gives no positions that can be read"]
+    path.with_suffix(".SRT").unlink()
+    assert value(listed(tmp_path, path)[1], "notes") == []
+
+
+def test_a_video_that_was_filmed_upright_is_stood_upright(tmp_path):
+    path = film(tmp_path / "phone.mp4")
+    content = bytearray(path.read_bytes())
+    # The matrix in the header of its track: a quarter turn, as phones write it.
+    matrix = content.find(b"tkhd") + 44
+    content[matrix : matrix + 36] = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 96 << 16, 0, 1 << 30)
+    path.write_bytes(content)
+    assert video_size(path) == (12, 96, 128)
+    assert {(photo.width, photo.height) for photo in listed(tmp_path, path)[0]} == {(96, 128)}
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "sentence"),
+    [
+        ("short.mp4", 2, r"the video .*short\.mp4 has 2 frames, at least 3 are needed"),
+        ("broken.mp4", 0, r"the video .*broken\.mp4 cannot be decoded; convert it to H\.264"),
+        ("notes.txt", 0, r"notes\.txt is neither a folder of photos nor a video"),
+    ],
+)
+def test_a_scene_s_bad_video_is_one_sentence(tmp_path, name, frames, sentence):
+    path = tmp_path / name
+    film(path, frames) if frames else path.write_bytes(b"x" * 100)
+    with pytest.raises(StageError, match=sentence):
+        listed(tmp_path, path)
+    assert not (tmp_path / "up").exists() and not (tmp_path / "photos.json").exists()
 
 
 def test_blur_lowers_sharpness():

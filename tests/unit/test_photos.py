@@ -13,8 +13,9 @@ from PIL import Image, TiffImagePlugin
 
 import scenefuse.photos.photo_files
 from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.photos.frames import VideoSettings, list_photos
 from scenefuse.photos.photo_files import photo_files, stored_size, upright_size
-from scenefuse.photos.photos import check_unchanged, inspect_photo, list_photos, read_photos, save_upright
+from scenefuse.photos.photos import check_unchanged, inspect_photo, read_photos, save_upright
 from scenefuse.photos.pictures import read_gray, read_raw, read_rgb, write_depth, write_picture
 from scenefuse.photos.positions import stated_position
 
@@ -32,7 +33,7 @@ def save(path, size=(40, 30), gps=None, shade=100, focal_35mm=None, orientation=
 
 
 def listed(tmp_path, folder):
-    list_photos(folder=folder, upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+    list_photos(source=folder, upright=tmp_path / "upright", photos=tmp_path / "photos.json", settings=VideoSettings())
     return read_photos(tmp_path / "photos.json")
 
 
@@ -275,7 +276,9 @@ def test_photos_that_are_not_what_their_ending_says_are_read_by_colmap(tmp_path,
     (tmp_path / "p").mkdir()
     for name, blue in (("a.jpg", 50), ("b.png", 60)):
         Image.new("RGB", (40, 30), (200, 100, blue)).save(tmp_path / "p" / name, form)
-    list_photos(folder=tmp_path / "p", upright=tmp_path / "up", photos=tmp_path / "photos.json")
+    list_photos(
+        source=tmp_path / "p", upright=tmp_path / "up", photos=tmp_path / "photos.json", settings=VideoSettings()
+    )
     for name, blue in (("a.jpg", 50), ("b.png", 60)):
         pixels = pycolmap.Bitmap.read(tmp_path / "up" / name, True).to_array()
         assert np.abs(pixels[5, 5].astype(int) - [200, 100, blue]).max() <= 12

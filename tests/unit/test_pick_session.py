@@ -127,6 +127,19 @@ def test_frames_of_a_video_are_clicked_in_the_video_s_pixels(yard):
     assert (picture.width, picture.height, picture.scale) == (1600, 1200, 0.25)
 
 
+def test_a_scene_s_video_is_clicked_in_once_its_frames_are_there(yard):
+    (yard.path / "flown.mp4").write_bytes(b"video")
+    yard.scenes = "scene\tphotos\nyard\tflown.mp4\n"
+    assert [table.column for table in opened(yard).tables] == ["prompts"]
+    frames = yard.path / "results/scenes/yard/photos"
+    frames.mkdir(parents=True)
+    cv2.imwrite(str(frames / "frame_000003.jpg"), np.zeros((300, 400, 3), dtype=np.uint8))
+    origin = {"frame_000003.jpg": {"frame": 3, "width": 400, "height": 300}}
+    write_json(frames.parent / "photos.json", {"origin": {"value": origin, "unit": ""}})
+    fiducials = opened(yard).tables[1]
+    assert fiducials.column == "fiducials" and fiducials.sizes == {"frame_000003.jpg": (400, 300)}
+
+
 def test_the_only_object_needs_no_name_and_of_two_one_is_named(yard):
     assert Session(None, (yard.write(),)).name == "shed"
     yard.objects += "barn\tyard\tclose\t\t\t\n"

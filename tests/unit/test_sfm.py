@@ -11,9 +11,9 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.core.transforms import fit_sim3
 from scenefuse.georef.georeference import camera_poses
 from scenefuse.mvs.undistort import UndistortSettings, undistort_photos, undistort_picture
-from scenefuse.photos.frames import FrameSettings, extract_frames
+from scenefuse.photos.frames import FrameSettings, VideoSettings, extract_frames, list_photos
 from scenefuse.photos.geodesy import LocalFrame
-from scenefuse.photos.photos import Photo, list_photos, read_photos, write_photos
+from scenefuse.photos.photos import Photo, read_photos, write_photos
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm import mapping
 from scenefuse.sfm.colmap import cancellable, doubtful_photos, explained_matches, require_database
@@ -153,7 +153,7 @@ def test_a_zoom_lens_that_does_not_tell_its_35_mm_equivalent_is_a_camera_for_eac
             exif[0x8769] = {0x920A: focal_mm}
         Image.new("RGB", (40, 40), (number, 0, 0)).save(folder / f"{number}.jpg", exif=exif)
     wanted = [["0.jpg", "3.jpg"], ["1.jpg", "2.jpg"], ["4.jpg"], ["5.jpg"]]
-    list_photos(folder=folder, upright=tmp_path / "upright", photos=tmp_path / "scene.json")
+    list_photos(source=folder, upright=tmp_path / "upright", photos=tmp_path / "scene.json", settings=VideoSettings())
     settings = FrameSettings(max_width_px=20)
     extract_frames(source=folder, frames=tmp_path / "frames", photos=tmp_path / "object.json", settings=settings)
     for name in ("scene", "object"):
@@ -201,7 +201,9 @@ def capture(tmp_path_factory):
         u, v = (hit[..., 0] * 75 + 256) % 512, (hit[..., 1] * 75 + 128) % 256
         Image.fromarray(texture[v.astype(int), u.astype(int)]).save(folder / "photos" / NAMES[index])
         centres.append(centre)
-    list_photos(folder=folder / "photos", upright=folder / "upright", photos=folder / "photos.json")
+    list_photos(
+        source=folder / "photos", upright=folder / "upright", photos=folder / "photos.json", settings=VideoSettings()
+    )
     return folder, np.array(centres)
 
 
@@ -433,7 +435,12 @@ def test_a_photo_that_was_replaced_is_named_by_those_who_read_it(tmp_path):
     (tmp_path / "photos").mkdir()
     for index in range(3):
         Image.new("RGB", (40, 30), (100 + index, 0, 0)).save(tmp_path / "photos" / f"{index}.png")
-    list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+    list_photos(
+        source=tmp_path / "photos",
+        upright=tmp_path / "upright",
+        photos=tmp_path / "photos.json",
+        settings=VideoSettings(),
+    )
     Image.new("RGB", (40, 30), (200, 0, 0)).save(tmp_path / "photos" / "1.png")
     reading = {"folder": tmp_path / "upright", "photos": tmp_path / "photos.json"}
     with pytest.raises(StageError, match=r"1\.png is not the photo that was listed any more"):
@@ -455,7 +462,12 @@ def test_a_portrait_photo_of_a_scene_has_a_portrait_camera(tmp_path):
     exif[0x0112] = 6
     for index in range(3):
         Image.fromarray(noise).save(tmp_path / "photos" / f"{index}.jpg", exif=exif)
-    list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+    list_photos(
+        source=tmp_path / "photos",
+        upright=tmp_path / "upright",
+        photos=tmp_path / "photos.json",
+        settings=VideoSettings(),
+    )
     extract_features(
         folder=tmp_path / "upright",
         photos=tmp_path / "photos.json",
@@ -474,7 +486,12 @@ def test_a_calibration_is_turned_along_with_photos_that_exif_rotates(tmp_path, s
         exif[0x0112] = orientation
         noise = np.random.default_rng(index).integers(0, 255, (120, 160, 3), dtype=np.uint8)
         Image.fromarray(noise).save(tmp_path / "photos" / f"{index}.jpg", exif=exif)
-    list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+    list_photos(
+        source=tmp_path / "photos",
+        upright=tmp_path / "upright",
+        photos=tmp_path / "photos.json",
+        settings=VideoSettings(),
+    )
     (tmp_path / "camera.txt").write_text("1 PINHOLE 160 120 150 151 70 52" if stored else "1 PINHOLE 120 160 9 9 50 70")
     extract_features(
         folder=tmp_path / "upright",
@@ -531,7 +548,12 @@ def test_photos_that_show_different_things_or_nothing(tmp_path, seen, advice):
         noise = gaussian_filter(rng.uniform(0, 255, (120, 160)), 1.5)
         noise = (noise - noise.min()) / np.ptp(noise) * 140 * seen + 110 + index
         Image.fromarray(noise.astype(np.uint8)).save(tmp_path / "photos" / f"{index}.png")
-    list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+    list_photos(
+        source=tmp_path / "photos",
+        upright=tmp_path / "upright",
+        photos=tmp_path / "photos.json",
+        settings=VideoSettings(),
+    )
     extract_features(
         folder=tmp_path / "upright",
         photos=tmp_path / "photos.json",

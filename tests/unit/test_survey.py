@@ -15,8 +15,9 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.georef.control import read_control
 from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.placement import GeoreferenceSettings
+from scenefuse.photos.frames import VideoSettings, list_photos
 from scenefuse.photos.geodesy import frame_notes, scene_frame
-from scenefuse.photos.photos import gps_accuracies, list_photos, read_photos
+from scenefuse.photos.photos import gps_accuracies, read_photos
 from scenefuse.photos.positions import Position, positions_of, read_geo
 from scenefuse.sfm.mapping import in_metres
 
@@ -228,8 +229,7 @@ def test_heights_may_be_unknown_and_the_crs_may_have_a_vertical_part(tmp_path, m
             | {"origin_altitude_m": 470.0},
             [
                 "x y z: metres east, north, up of 400000 5000000 0.5 in ETRS89 / UTM zone 32N (EPSG:25832)",
-                "heights: as the photos' GPS gives them (EXIF), which does not say whether above the ellipsoid or the"
-                " sea",
+                "heights: as the photos' GPS gives them, which does not say whether above the ellipsoid or the sea",
             ],
         ),
     ],
@@ -367,7 +367,7 @@ def a_photo(folder, name, xmp=b"", orientation=1):
 
 
 def listed(folder, tmp_path):
-    list_photos(folder=folder, upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+    list_photos(source=folder, upright=tmp_path / "upright", photos=tmp_path / "photos.json", settings=VideoSettings())
     return {photo.name: photo for photo in read_photos(tmp_path / "photos.json")}
 
 

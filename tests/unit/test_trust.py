@@ -17,7 +17,7 @@ from scenefuse.core.project import read_project
 from scenefuse.core.settings import read_differences
 from scenefuse.core.stage import StageError
 from scenefuse.photos.cameras.metashape import read_metashape
-from scenefuse.photos.photos import list_photos
+from scenefuse.photos.frames import VideoSettings, list_photos
 
 
 @pytest.mark.parametrize("name", ["../yard", "a b", "$(touch x)", "-rf", "a;b", "<b>"])
@@ -78,7 +78,12 @@ def test_a_picture_of_ten_billion_pixels_is_refused_before_it_is_decoded(tmp_pat
     pixels = chunk(b"IDAT", zlib.compress(bytes(100)))
     (tmp_path / "photos/a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + size + pixels + chunk(b"IEND", b""))
     with pytest.raises(StageError, match=r"a\.png"):
-        list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+        list_photos(
+            source=tmp_path / "photos",
+            upright=tmp_path / "upright",
+            photos=tmp_path / "photos.json",
+            settings=VideoSettings(),
+        )
 
 
 def test_xml_with_entities_is_not_parsed(tmp_path):

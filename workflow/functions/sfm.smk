@@ -10,15 +10,15 @@ def photos_of(row, who):
 
 
 def scene_photos(wildcards):
-    """The photos of a scene, and the file of their positions where there is one."""
+    """The photos of a scene, or its video, and the file of their positions where there is one."""
     folder = photos_of(scene_row(wildcards.scene), f"scene '{wildcards.scene}'")
     photos = photos_in(folder, f"{config['scenes']}, scene '{wildcards.scene}'")
     positions = geo_file(Path(folder))
     return photos + ([str(positions)] if positions else [])
 
 
-def scene_folder(wildcards):
-    """Their folder, for a command line."""
+def scene_source(wildcards):
+    """Their folder, or the video, for a command line."""
     return shlex.quote(scene_row(wildcards.scene).get("photos", ""))
 
 
@@ -86,7 +86,7 @@ def check_survey(scene):
     """Stop before hours of mapping where a survey's file cannot be read or names photos that the scene lacks."""
     row, files = scene_row(scene), surveyed(scene)
     own = {column: Path(f) for column, f in files.items() if not made_here(f)}
-    if own and not made_here(row["photos"]):
+    if own and Path(row["photos"]).is_dir() and not made_here(row["photos"]):
         # Takes long to import, and most scenes have no survey.
         from scenefuse.photos.photos import distinct_photos
         from scenefuse.georef.control import check_survey_files

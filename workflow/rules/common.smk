@@ -16,7 +16,7 @@ from scenefuse.core.fingerprint import files_fingerprint, fingerprint
 from scenefuse.core.project import read_project
 from scenefuse.core.settings import PACKAGE, ROOT as SHIPPED
 from scenefuse.core.machine import has_gpu, megapixels, memory_mb
-from scenefuse.photos.photo_files import camera_files, geo_file, photo_files
+from scenefuse.photos.photo_files import camera_files, geo_file, photo_files, subtitles
 from scenefuse.core.stage import DISK_FULL, MIN_FREE_BYTES, StageError
 
 # A file that a run holds until it ends, among Snakemake's locks and removed with them.
@@ -341,10 +341,11 @@ def made_here(path):
 
 @cache
 def photos_in(path, where):
-    """The files that a cell of a table or a setting stands for: the photos of a folder, a file, or what a rule makes."""
+    """The files that a cell of a table or a setting stands for: the photos of a folder, a file with a video's subtitles, or what a rule makes."""
     path = str(Path(path))
     if made_here(path) or Path(path).is_file():
-        return [path]
+        beside = subtitles(Path(path))
+        return [path, *([str(beside)] if beside else [])]
     if Path.cwd().is_relative_to(Path(path).resolve()):
         refuse(
             f"{where}: the project lies in its folder of photos, {path}, whose files would count as photos; put the"

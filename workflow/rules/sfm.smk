@@ -14,7 +14,7 @@ include: "../functions/sfm.smk"
 
 
 rule list_photos:
-    """List the flight's photos, turn rotated ones upright, and stop at one that cannot be read."""
+    """The flight's photos, or frames of its video: turn rotated ones upright, and stop at one that cannot be read."""
     input:
         as_inputs(scene_photos),
     output:
@@ -28,17 +28,18 @@ rule list_photos:
     conda:
         "../../envs/reconstruction.yaml"
     resources:
-        mem_mb=lambda wildcards, attempt: 1000 * attempt,
-        runtime=lambda wildcards, attempt: 30 * attempt,
+        mem_mb=lambda wildcards, attempt: 2000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        folder=scene_folder,
+        source=scene_source,
+        options=settings("scene.frames"),
         script=script("photos/list_photos.py"),
         files=state_of(scene_photos),
         code=code("photos/list_photos.py"),
     message:
         "Scene {wildcards.scene}: checking the photos"
     shell:
-        "exec python {params.script} --folder {params.folder} --upright {output.upright} --photos {output.photos} &> {log}"
+        "exec python {params.script} --source {params.source} --upright {output.upright} --photos {output.photos} {params.options} &> {log}"
 
 
 rule extract_frames:
