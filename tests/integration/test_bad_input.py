@@ -166,6 +166,16 @@ def test_a_click_in_a_photo_that_is_used_since_others_are_copies_is_no_error(pro
     assert result.returncode == 0, result.stdout
 
 
+def test_masks_of_other_photos_stop_before_anything_runs(project, refused):
+    project.photos("close")
+    project.photos("masks")
+    for k in range(3):
+        (project.path / f"masks/{k}.jpg").rename(project.path / f"masks/DJI_{k}.jpg")
+    project.scenes, project.objects = "scene\tphotos\n", HEADER + "shed\t\tclose\t\t\tmasks\n"
+    said = "object 'shed': masks that match no photo: 3 masks in masks (first: DJI_0.jpg), photos are named like 0.jpg;"
+    assert said in refused("-n", "results/objects/shed/masks.png")
+
+
 def test_control_points_in_unknown_photos_stop_before_anything_runs(project, refused):
     project.photos("flight")
     project.scenes = "scene\tphotos\tcontrol\nyard\tflight\tgcp.txt\n"

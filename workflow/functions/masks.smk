@@ -1,7 +1,7 @@
 # What masks are made from, and how.
 from scenefuse.masks.algebra import mask_folders
 from scenefuse.masks.sam2_weights import WEIGHTS
-from scenefuse.photos.photo_files import pictures_below
+from scenefuse.photos.photo_files import masks_by_name, no_match, pictures_below
 
 
 @cache
@@ -21,6 +21,19 @@ def kept_masks(wildcards):
     return keep.replace("{object}", wildcards.object)
 
 
+@cache
+def check_masks(name):
+    """Stop before hours of work where a folder of masks has none of the object's photos."""
+    row, where = object_row(name), f"{config['objects']}, object '{name}'"
+    photos = [frame_name(photo) for photo in names_in(row["photos"], where) or ()]
+    if photos and not made_here(row["masks"]):
+        try:
+            if not masks_by_name(photos, Path(row["masks"])):
+                refuse(f"{where}: {no_match(Path(row['masks']), photos[0])}")
+        except StageError as error:
+            refuse(f"{where}: {error}")
+
+
 def mask_inputs(wildcards):
     """What the masks of an object are made from: your own masks, or prompts and perhaps weights; masks to combine."""
     row = object_row(wildcards.object)
@@ -33,9 +46,11 @@ def mask_inputs(wildcards):
     where = f"object.masks.keep of '{wildcards.object}'"
     files = [file for folder in folders for file in masks_in(str(folder), where)]
     if row.get("masks"):
-        return files + masks_in(
+        files += masks_in(
             row["masks"], f"{config['objects']}, masks of '{wildcards.object}'"
         )
+        check_masks(wildcards.object)
+        return files
     if not row.get("prompts"):
         refuse(
             f"{config['objects']}: '{wildcards.object}' has neither prompts nor masks; fill one of these columns"
