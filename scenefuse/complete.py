@@ -20,7 +20,7 @@ from scenefuse.core.machine import has_screen
 from scenefuse.core.settings import OWN_SETTINGS, PACKAGE, ROOT, read_differences
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_cells, read_table
-from scenefuse.new_project import OBJECTS, SCENES, cell_of, default_name, fill, make_project, project_rows
+from scenefuse.new_project import OBJECTS, SCENES, cell_of, default_name, fill, is_cloud, make_project, project_rows
 from scenefuse.report.facts import closing_lines
 from scenefuse.report.forecast import FORECAST, duration, read_forecast, seconds_left
 
@@ -57,8 +57,8 @@ def complete(
         house: close-up photos of an object in it, likewise.
         others: the same of more objects.
         out: folder of the project; where it is left out, FLIGHT_completed.
-        prompts: tables of clicks, one for each object in its order, in place of the page.
-        masks: folders of masks, one for each object in its order, named like its photos; white is the object.
+        prompts: tables of clicks, one for each object with photos in its order, in place of the page.
+        masks: folders of masks, likewise, named like its photos; white is the object.
         preset: of a new project: settings for a first look, the shipped ones (normal, where it is left out), or larger
             ones for a GPU.
         cores: processor cores; where it is left out, all.
@@ -69,11 +69,12 @@ def complete(
     """
     objects, shows = (house, *others), has_screen() and not no_browser
     project, files = out or Path(f"{default_name(flight)}_completed"), {"prompts": prompts, "masks": masks}
-    _check_options(files, len(objects), cores)
+    photographed = [path for path in objects if not is_cloud(path)]
+    _check_options(files, len(photographed), cores)
     _make_or_go_on(project, flight, objects, preset)
     for column, given in files.items():
         if given:
-            cells = {default_name(o): cell_of(path, project) for o, path in zip(objects, given)}
+            cells = {default_name(o): cell_of(path, project) for o, path in zip(photographed, given)}
             fill(project / OBJECTS, column, cells)
     for name in _without_clicks(project, cores):
         _click(project, name, shows)
@@ -117,7 +118,9 @@ def _check_options(files: Mapping[str, Sequence[Path]], objects: int, cores: int
     """StageError where an option cannot be used: before anything is made, so that a corrected command starts anew."""
     for column, given in files.items():
         if given and len(given) != objects:
-            raise StageError(f"--{column} names {len(given)} for {objects} objects; give one for each, in their order")
+            raise StageError(
+                f"--{column} names {len(given)} for {objects} objects with photos; give one for each, in their order"
+            )
         missing = next((path for path in given if not path.exists()), None)
         if missing is not None:
             raise StageError(f"{missing} does not exist; correct --{column}")

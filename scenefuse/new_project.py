@@ -133,20 +133,24 @@ def _source(path: Path, folder: Path) -> dict[str, str]:
     if not path.exists():
         raise StageError(f"{path} does not exist; give a folder of photos, a video or a cloud")
     suffix = path.suffix.lower()
-    is_cloud = path.is_file() and suffix in READERS
     if path.is_dir():
         if folder.resolve().is_relative_to(path.resolve()):
             raise StageError(f"the project {folder} would lie among its photos in {path}; give a folder of its own")
         if (count := len(photo_files(path))) < FIXING_POINTS:
             raise StageError(f"{path} holds {count} {'photo' if count == 1 else 'photos'}; cameras need three or more")
-    elif not (is_cloud or suffix in VIDEO_SUFFIXES):
+    elif not (is_cloud(path) or suffix in VIDEO_SUFFIXES):
         raise StageError(f"{path} is not a folder of photos, a video nor a cloud ({', '.join(READERS)})")
     elif path.stat().st_size == 0:
         raise StageError(f"{path} is empty; export it again")
     elif suffix in TEXTS:
         # Notes are text too.
         next(columns_in_parts(path)())
-    return {"cloud" if is_cloud else "photos": cell_of(path, folder)}
+    return {"cloud" if is_cloud(path) else "photos": cell_of(path, folder)}
+
+
+def is_cloud(path: Path) -> bool:
+    """Whether a path is that of a cloud or mesh."""
+    return path.is_file() and path.suffix.lower() in READERS
 
 
 def cell_of(path: Path, folder: Path) -> str:

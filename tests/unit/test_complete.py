@@ -93,6 +93,14 @@ def test_more_objects_are_added_by_a_command_that_names_the_others_too(two_folde
     assert [row["photos"] for row in rows.values()] == [str(two_folders / name) for name in ("close", "shed")]
 
 
+def test_clicks_are_of_the_objects_with_photos_beside_one_that_is_a_cloud(two_folders, workflow):
+    Path("wall.xyz").write_text("1 2 3\n4 5 6\n7 8 10\n")
+    workflow(SUMMARY)
+    run("wall.xyz", "close", prompts=(Path("clicks.tsv"),))
+    rows = read_table(Path("flight_completed/config/objects.tsv"), "object")
+    assert rows["close"]["prompts"] == str(two_folders / "clicks.tsv") and not rows["wall"]["prompts"]
+
+
 def test_a_second_run_in_the_same_project_is_refused_and_leaves_the_first_ones_log(two_folders, workflow):
     workflow(SUMMARY)
     run("close", prompts=(Path("clicks.tsv"),))
@@ -129,7 +137,10 @@ def test_masks_take_the_place_of_clicks(two_folders, workflow):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"prompts": (Path("clicks.tsv"), Path("clicks.tsv"))}, "--prompts names 2 for 1 objects; give one for each"),
+        (
+            {"prompts": (Path("clicks.tsv"), Path("clicks.tsv"))},
+            "--prompts names 2 for 1 objects with photos; give one",
+        ),
         ({"masks": (Path("nowhere"),)}, "nowhere does not exist; correct --masks"),
         ({"cores": 0}, "--cores 0 cannot be had; give 1 to"),
         ({"cores": 9999}, "--cores 9999 cannot be had; give 1 to"),
