@@ -122,10 +122,10 @@ def metashape(folder, lens=LENS, placed=EARTH, kind="frame"):
     return folder / "cameras.xml"
 
 
-def bundler(folder):
+def bundler(folder, views=FLIGHT.views):
     """As RealityCapture exports it: full paths of another machine, and a photo without a camera."""
     lines = ["# Bundle file v0.3", f"{len(FLIGHT.views) + 1} 0", *["0 0 0"] * 5]
-    for view in FLIGHT.views:
+    for view in views:
         cv2.imwrite(str(folder / "photos" / view.name), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
         flipped = np.diag([1.0, -1, -1]) @ view.cam_from_world[:3]
         rows = [[FOCAL, 0.0, 0.0], *flipped[:, :3], flipped[:, 3]]
@@ -241,6 +241,18 @@ def test_cameras_of_photos_as_stored_are_turned_with_what_exif_turns(tmp_path, o
         assert said == f"the cameras of {len(turned)} photos were turned, as EXIF rotates these photos"
     else:
         assert "does not say whether its cameras are for them as they are stored: they are taken as stored" in said
+
+
+@pytest.mark.parametrize(("orientation", "quarters"), [(1, 0), (6, 1), (8, 3)])
+def test_cameras_without_the_shape_of_their_photos_are_tried_as_of_stored_ones_too(tmp_path, orientation, quarters):
+    with_database(tmp_path)
+    turned = dict.fromkeys([view.name for view in FLIGHT.views][::2], 6 if orientation == 1 else orientation)
+    write_photos(tmp_path / "photos.json", FLIGHT.photos(), tmp_path, "photos", [], turned=quantity(turned, ""))
+    views = [as_stored(view, quarters if view.name in turned else 0) for view in FLIGHT.views]
+    report, model = mapped(tmp_path, bundler(tmp_path, views))
+    np.testing.assert_allclose(camera_poses(model)[2], FLIGHT.centres, atol=1e-6)
+    assert value(report, "points") > 150 and value(report, "mean_reprojection_error_px") < 0.01
+    assert f"they are taken as {'stored' if quarters else 'upright'}, whose matches" in value(report, "notes")[-1]
 
 
 def test_a_turned_lens_bends_as_before():

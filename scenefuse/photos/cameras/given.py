@@ -65,6 +65,7 @@ class PosedPhoto:
         object_from_cam: (4, 4) float64 rigid pose, OpenCV axes.
         mask: file of its mask where the format names one.
         held_out: the format keeps it for measuring.
+        sized: the format says how large the photo was.
     """
 
     name: str
@@ -73,6 +74,7 @@ class PosedPhoto:
     object_from_cam: NDArray[np.float64]
     mask: Path | None
     held_out: bool
+    sized: bool = True
 
 
 def colmap_camera(model: str, width: float, height: float, params: Sequence[float]) -> pycolmap.Camera:
@@ -131,8 +133,8 @@ def possible_turns(
 ) -> list[dict[str, PosedPhoto]]:
     """The cameras of photos by name as they may be meant, one way or two: for upright photos, or for stored ones.
 
-    The size of a photo on its side tells which, and then counts for those that stand on their heads as well. Where none
-    does, both ways are possible.
+    The size of a photo on its side, where the format has it, tells which, and then counts for those that stand on their
+    heads as well. Where none does, both ways are possible.
 
     Args:
         posed: cameras as given.
@@ -142,19 +144,17 @@ def possible_turns(
     Raises:
         StageError: a photo on its side has a lens that cannot be turned.
     """
-    turned = {
-        name: QUARTERS[o] for name, o in orientations.items() if o in QUARTERS and name in posed and name in sizes
-    }
+    turns = {name: QUARTERS[o] for name, o in orientations.items() if o in QUARTERS and name in posed and name in sizes}
     stored, as_they_are = list[str](), list[str]()
-    for name in (name for name, quarters in turned.items() if quarters % 2):
+    for name in (name for name, quarters in turns.items() if quarters % 2 and posed[name].sized):
         own = posed[name].camera.width, posed[name].camera.height
         upright, lying = same_shape(own, sizes[name]), same_shape(own, sizes[name][::-1])
         stored += [name] if lying and not upright else []
         as_they_are += [name] if upright and not lying else []
-    if not turned or (as_they_are and not stored):
+    if not turns or (as_they_are and not stored):
         return [dict(posed)]
     other = dict(posed) | {
-        name: stood_upright(posed[name], quarters) for name, quarters in turned.items() if name not in as_they_are
+        name: stood_upright(posed[name], quarters) for name, quarters in turns.items() if name not in as_they_are
     }
     return [other] if stored else [dict(posed), other]
 
@@ -166,7 +166,9 @@ def stood_upright(photo: PosedPhoto, quarters: int) -> PosedPhoto:
         StageError: its lens has parameters that depend on the axes and that are not known here.
     """
     pose = photo.object_from_cam @ np.linalg.matrix_power(FROM_STORED.T, quarters)
-    return replace(photo, camera=turned(photo.camera, quarters, photo.file.name), object_from_cam=pose)
+    # A lens for a photo of unknown shape was made for the upright one.
+    lens = turned(photo.camera, quarters, photo.file.name) if photo.sized else photo.camera
+    return replace(photo, camera=lens, object_from_cam=pose)
 
 
 def turned(lens: pycolmap.Camera, quarters: int, name: str) -> pycolmap.Camera:

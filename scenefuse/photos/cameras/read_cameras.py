@@ -199,11 +199,17 @@ def _posed(one: GivenCamera, file: Path, where: str, size_of: SizeOf) -> PosedPh
         )
     left, _, right = np.linalg.svd(turn)
     pose[:3, :3] = left @ right
+    asked: list[Path] = []
+
+    def size() -> Size:
+        asked.append(file)
+        return size_of(file)
+
     try:
-        camera = one.camera if isinstance(one.camera, pycolmap.Camera) else one.camera(lambda: size_of(file))
+        camera = one.camera if isinstance(one.camera, pycolmap.Camera) else one.camera(size)
     except ValueError as error:
         raise StageError(f"{where}: the camera of {one.name}: {error}; correct it") from None
-    return PosedPhoto(one.name, file, camera, pose, one.mask, one.held_out)
+    return PosedPhoto(one.name, file, camera, pose, one.mask, one.held_out, not asked)
 
 
 def _read_bundler(file: Path) -> list[GivenCamera]:
