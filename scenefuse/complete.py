@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from scenefuse.core.job_records import KILLED, last_error
 from scenefuse.core.machine import has_screen
 from scenefuse.core.settings import OWN_SETTINGS, PACKAGE, ROOT, read_differences
 from scenefuse.core.stage import StageError
@@ -27,6 +28,7 @@ from scenefuse.report.forecast import FORECAST, duration, read_forecast, seconds
 LOG, SUMMARY = Path("results/logs/run.log"), Path("results/summary")
 # Lines of a run that people want to see, or that say why it failed.
 JOB, FORECAST_LINE = re.compile(r"Job \d+: (.+)"), re.compile("(time|memory|disk): .+")
+FAILED_LOG = re.compile(r"Logfile (results/logs/\S+/(\S+)\.log):")
 ERROR, FAILED, CLOSING = re.compile(r"\w*(Error|Exception)\b.*:"), ("failed: ", "error: "), "Result: "
 Preset = Literal["draft", "normal", "high"]
 Folder = tyro.conf.Positional[Path]
@@ -149,7 +151,8 @@ def _click(project: Path, name: str, shows: bool) -> None:
         StageError: nobody can, or nobody did.
     """
     by_file = (
-        f"give its clicks by --prompts FILE or its masks by --masks FOLDER, or click in {project} by scenefuse pick"
+        f"give its clicks by --prompts FILE or its masks by --masks FOLDER (docs/clicking.md), or run scenefuse pick in"
+        f" {project} and open the address that it prints from a computer with a screen"
     )
     if not shows and not sys.stdin.isatty():
         raise StageError(f"{name} has no clicks yet, and there is no screen to click on; {by_file}")
@@ -224,14 +227,17 @@ def _run_workflow(project: Path, targets: list[str], cores: int | None) -> None:
 
 
 def report_step(project: Path, line: str, started: float, cores: int) -> None:
-    """Print a line of a run's log, if it says what a run will take or that a job starts; with the time left."""
-    job = JOB.fullmatch(line)
+    """Print a line of a run's log, if it says what a run will take, that a job starts, or that one failed."""
+    job, failed = JOB.fullmatch(line), FAILED_LOG.fullmatch(line)
     if FORECAST_LINE.fullmatch(line):
         print(line[0].upper() + line[1:], flush=True)
     elif job:
         planned = read_forecast(project / "results/logs" / FORECAST)
         left = duration(seconds_left(planned, project, started, cores))
         print(f"{time.strftime('%H:%M')} {job[1]}; about {left} left", flush=True)
+    elif failed and (project / failed[1]).is_file():
+        why = last_error(project / failed[1]) or KILLED
+        print(f"{time.strftime('%H:%M')} {failed[2]} failed: {why} [{project / failed[1]}]", flush=True)
 
 
 def _why(lines: Sequence[str]) -> str:

@@ -8,8 +8,8 @@ from scenefuse.core.stage import lack_in
 
 ERROR = re.compile(r"\s*(error:|[\w.]*(Error|Exception)\b)")
 KILLED = (
-    "its job was killed without a message, by kill -9 or because memory ran out; end other programs or raise the"
-    " memory limit, and run again to go on"
+    "its job ended without a message: it was stopped, or killed because memory ran out; run again to go on, with other"
+    " programs ended or a higher memory limit"
 )
 NOT_ACCEPTED = "its job ended well, but Snakemake refused its outputs for the reason printed above"
 NO_LOG = (

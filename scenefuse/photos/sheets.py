@@ -66,11 +66,13 @@ def draw_sheet(
     return figure
 
 
-def draw_scale(axes: Any, px_per_unit: float, unit: str, has_north: bool) -> None:
-    """A scale bar at the lower left of a map; an arrow above it to the north, where it is known to be up."""
+def draw_scale(axes: Any, px_per_unit: float, unit: str, has_north: bool, at_right: bool = False) -> None:
+    """A scale bar at a lower corner of a map; an arrow above it to the north, where it is known to be up."""
     right, low = axes.get_xlim()[1], axes.get_ylim()[0]
-    bar, start, box = round_below(right / px_per_unit / 4), 0.04 * right, {"color": "white", "alpha": 0.7, "pad": 1}
-    axes.plot([start, start + bar * px_per_unit], [0.96 * low] * 2, color="black", linewidth=3, zorder=5)
+    bar, box = round_below(right / px_per_unit / 4), {"color": "white", "alpha": 0.7, "pad": 1}
+    start = 0.96 * right - bar * px_per_unit if at_right else 0.04 * right
+    ends = [start, start + bar * px_per_unit], [0.96 * low] * 2
+    axes.plot(*ends, color="black", linewidth=3, solid_capstyle="butt", zorder=5)
     axes.text(start, 0.94 * low, f"{bar:g} {unit}", zorder=5, bbox=box)
     if has_north:
         arrow = {"arrowstyle": "-|>", "color": "black"}

@@ -51,7 +51,7 @@ def object_facts(row: Row) -> dict[str, str]:
         facts["Result"] += ". Perhaps it is not in this scene, or too little of it"
     if "height" in has:
         sides = " × ".join(length(has[side], unit) for side in ("length", "width")).replace(" scene units ×", " ×")
-        facts["Size"] = f"{sides}, {length(has['height'], unit)} high"
+        facts["Size"] = f"{sides}, {length(has['height'], unit)} high, overall"
     if "surface_missing" in has:
         lacks = {what: has.get(f"surface_{name}", 0.0) for name, what in WORDS["missing"].items()}
         there, missing, *kinds = percents(list(lacks.values()))
@@ -165,7 +165,7 @@ def _next(has: dict[str, Any]) -> dict[str, str]:
     parts = []
     if has.get("stations"):
         shows = (
-            f": this would show {percent(has['stations_show'])} of what no photo saw or photos dispute"
+            f": this would show {percent(has['stations_show'])} of what no photo shows, or where photos disagree"
             if "stations_show" in has
             else ""
         )
@@ -187,14 +187,15 @@ def scene_facts(row: Row) -> dict[str, str]:
         facts["Result"] = f"completed with {has['completed_by']}; {has['completed_points']:,.0f} points"
         if "removed_points" in has and "points" in has:
             added = has["completed_points"] - has["points"] + has["removed_points"]
-            facts["Result"] += f": {has['points']:,.0f} of the scene before, {added:,.0f} added, less "
-            facts["Result"] += f"{has['removed_points']:,.0f} that close-ups contradict or measured better"
+            facts["Result"] += f": {has['points']:,.0f} of the scene before, of which {has['removed_points']:,.0f} are"
+            facts["Result"] += f" removed or replaced by better ones, and {added:,.0f} added"
     elif "points" in has:
         facts["Result"] = f"{has['points']:,.0f} points, not completed with all objects yet"
-    facts["Photographed"] = "given as a cloud"
     if "registered" in has and "photos" in has:
         used = f"{has['registered']:.0f} of {has['photos']:.0f} photos used"
         facts["Photographed"] = f"{has.get('photographed', 'undated')}, {used}"
+    elif "error" not in has:
+        facts["Photographed"] = "given as a cloud"
     if unit == "m":
         facts["Coordinates"] = f"metres, {crs_name(has['crs'])}" if "crs" in has else "metres, in a local frame"
     else:
@@ -202,9 +203,9 @@ def scene_facts(row: Row) -> dict[str, str]:
     if "latitude_deg" in has:
         north, east = has["latitude_deg"], has["longitude_deg"]
         place = f"{abs(north):.5f}° {'NS'[north < 0]}, {abs(east):.5f}° {'EW'[east < 0]}"
-        above = f", {has['altitude_m']:,.1f} m high" if "altitude_m" in has else ""
+        above = f", {has['altitude_m']:,.1f} m" if "altitude_m" in has else ""
         facts["Heights"] = heights_of(has.get("crs"), has.get("control_points"), has.get("altitude_m"))
-        facts["Place"] = f"{place}{above}; from there the local frame counts metres east, north and up"
+        facts["Local frame"] = f"metres east, north and up from {place}{above}"
     if found := accuracies(row):
         facts["Position"] = f"absolute, where on Earth the scene lies: {found[0]}"
     if "length_unit" in has:
@@ -244,7 +245,7 @@ def made_by(summary: Path) -> str:
     file = summary / "scenes.tsv"
     day = date.fromtimestamp(file.stat().st_mtime) if file.is_file() else date.today()
     who = dict.fromkeys(filter(None, (_known(row).get("made_by") for row in records(read_table(file)))))
-    by = f" by {', '.join(who)}" if who else ", by whom is not stated (made_by in config/scenes.tsv)"
+    by = f" by {', '.join(who)}" if who else ""
     return f"Made with scenefuse {VERSION} on {day}{by}."
 
 

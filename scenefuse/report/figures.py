@@ -177,7 +177,9 @@ def _before_after(name: str, join: Surroundings, clouds: Discs) -> Figure:
     for cloud, radii in clouds:
         near = within(cloud.points[:, :2], low[:2], high[:2])
         from_below = render(cloud[near], orbit_camera(join.framed, SIDES_DEG[0], -14.0, TILE_PX), radii[near])
-        rows.append([*_sides(cloud, join.framed, radii), ("from below, surroundings cut away", from_below)])
+        rows.append(
+            [*_sides(cloud, join.framed, radii, join.has_north), ("from below, surroundings cut away", from_below)]
+        )
     labels = ["before", "after" if join.fused else "after (not fused)"]
     return draw_sheet(f"{name}: before and after", join.decision, rows, labels=labels)
 
@@ -197,19 +199,21 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     for number, place in enumerate(shown_from, 1):
         x, y, z = place - middle
         label = f"from station {number}, {np.linalg.norm([x, y, z]):.3g} {join.unit}"
-        label += f" to the {compass(np.degrees(np.arctan2(x, y)))}" if join.has_north else " away"
+        label += f" {compass(np.degrees(np.arctan2(x, y)))} of it" if join.has_north else " away"
         cameras[label] = camera_at(place, join.framed, TILE_PX)
     for azimuth in SIDES_DEG[len(cameras) :]:
-        cameras[f"azimuth {azimuth:.0f}°"] = orbit_camera(join.framed, azimuth, 20.0, TILE_PX)
+        cameras[_from(azimuth, join.has_north)] = orbit_camera(join.framed, azimuth, 20.0, TILE_PX)
     pictures = [(label, render(cloud, camera, sizes, colors)) for label, camera in cameras.items()]
     seen = ", ".join(f"{color}: {WORDS['missing'][kind.name.lower()]}" for kind, (color, _) in LACKS.items())
     shown = f", the best {len(shown_from)} shown" if len(shown_from) < len(join.stations) else ""
     note = f"{seen}\n{len(join.stations)} stations to photograph it from{shown}; where they are: next_photos.csv"
     sheet = draw_sheet(f"{name}: what is still missing", note, [pictures[:2], pictures[2:]])
     axes, target = sheet.axes[0], from_above.project(middle[None])[0][0]
-    draw_scale(axes, from_above.focal_px, join.unit, join.has_north)
+    places = from_above.project(join.stations)[0]
+    in_the_way = (places < [0.45 * TILE_PX[0], np.inf]) & (places > [-np.inf, 0.6 * TILE_PX[1]])
+    draw_scale(axes, from_above.focal_px, join.unit, join.has_north, at_right=bool(in_the_way.all(1).any()))
     # The best one lies on top, where two are close to each other.
-    for number, at in reversed([*enumerate(from_above.project(join.stations)[0], 1)]):
+    for number, at in reversed([*enumerate(places, 1)]):
         arrow = {"arrowstyle": "->", "color": "0.5", "shrinkB": 40}
         mark = {"boxstyle": "circle,pad=0.15", "facecolor": "black", "edgecolor": "white"}
         axes.annotate(
@@ -256,10 +260,15 @@ def _object_sheet(
     return draw_sheet(title, note, rows, labels=["depth", "renders", "cloud"])
 
 
-def _sides(cloud: Cloud, framed: Array, radii: ArrayLike) -> list[Cell]:
+def _sides(cloud: Cloud, framed: Array, radii: ArrayLike, has_north: bool = False) -> list[Cell]:
     """A cloud from four sides, all of `framed` in each picture."""
     cameras = {azimuth: orbit_camera(framed, azimuth, 20.0, TILE_PX) for azimuth in SIDES_DEG}
-    return [(f"azimuth {azimuth:.0f}°", render(cloud, camera, radii)) for azimuth, camera in cameras.items()]
+    return [(_from(azimuth, has_north), render(cloud, camera, radii)) for azimuth, camera in cameras.items()]
+
+
+def _from(azimuth_deg: float, has_north: bool) -> str:
+    """From where something is seen: in words where x is known to be east."""
+    return f"from the {compass(90 - azimuth_deg)}" if has_north else f"azimuth {azimuth_deg:.0f}°"
 
 
 def _depth_row(photos: list[Path], masks: Path, stages: tuple[Path, ...]) -> list[Cell]:

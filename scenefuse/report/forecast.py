@@ -182,7 +182,7 @@ def forecast_lines(
     ]
     unknown = [folder.name for folder, size in needed.items() if size is None]
     if unknown:
-        lines[0] += f"; not counted, for no photos are there: {', '.join(unknown)}"
+        lines[0] += f"; without those that have no photos: {', '.join(unknown)}"
     if memory_mb[most] > available_mb:
         lines[1] += f", and this machine has {size_text(1e6 * available_mb)}: set fewer pixels or features for it"
     return lines + _disk(needed, keep_maps)

@@ -20,7 +20,7 @@ from matplotlib.colors import to_hex
 from PIL import Image
 
 from scenefuse.core.stage import StageError
-from scenefuse.report.values import asset
+from scenefuse.report.values import asset, length
 from scenefuse.report.view import LEVELS, REMOVED, Shown, View, encode
 from scenefuse.report.view_mesh import ViewMesh, encode_mesh
 from scenefuse.surface.mesh import FaceClass
@@ -96,7 +96,7 @@ def view_section(key: str, name: str, view: View, mesh: ViewMesh | None = None, 
         # An object by itself has no before and after.
         no_surface=" hidden" if mesh is None else "",
         one_cloud="" if (view.cloud.fields["shown"] != Shown.BOTH).any() else " hidden",
-        whens=_choice(f"when-{key}", whens, "after"),
+        whens=_choice(f"when-{key}", whens, "after" if mesh is None else "surface"),
         colours=_choice(f"colour-{key}", buttons, modes[0]["name"]),
         # A closing tag inside JSON would end the script element.
         about=json.dumps(about).replace("</", "<\\/"),
@@ -133,7 +133,7 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
     modes: list[Mode] = []
     other = {"color": UNKNOWN_COLOR, "label": "unknown"}
     if view.cloud.colors is not None:
-        modes.append({"name": "photo", "button": "Colours", "label": "The points' own colours"})
+        modes.append({"name": "photo", "button": "Photos", "label": "The colours of the photos"})
     codes = sorted(set(view.sources) - {REMOVED})
     sources = {code: (SOURCE_COLORS[k % len(SOURCE_COLORS)], view.sources[code]) for k, code in enumerate(codes)}
     sources[REMOVED] = (REMOVED_COLOR, "scene, removed by fusion")
@@ -144,7 +144,7 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
         modes.append({"name": "evidence", "button": "Class", "other": other, "entries": found})
     if deviations is not None:
         ramp = [to_hex(color) for color in colormaps["viridis"](np.linspace(0, 1, LEVELS))]
-        low, high = (f"{end:.2g} {view.unit}" for end in deviations)
+        low, high = (length(end, view.unit) for end in deviations)
         entries = [{"code": k + 1, "color": color} for k, color in enumerate(ramp)]
         ends: Mode = {"ramp": ramp[::3], "low": low, "high": high}
         modes.append({"name": "deviation", "button": "Std. deviation", "other": other, "entries": entries} | ends)
@@ -162,7 +162,7 @@ def _mesh_modes(mesh: ViewMesh, deviation: list[Mode]) -> list[Mode]:
     if mesh.uv is not None or mesh.vertices.colors is not None:
         bridged = [entry for entry in found if entry["code"] == FaceClass.BRIDGED]
         label = "The photos on the mesh" if mesh.uv is not None else "The points' colours on the mesh"
-        modes.append({"name": "photo", "button": "Colours", "label": label, "entries": bridged, "other": other})
+        modes.append({"name": "photo", "button": "Photos", "label": label, "entries": bridged, "other": other})
     modes.append({"name": "evidence", "button": "Class", "entries": found, "other": other})
     return modes + deviation
 

@@ -109,7 +109,8 @@ def _facts(facts: dict[str, str]) -> str:
         return f'<a href="../{file[1]}">{file[0].replace("/", "/<wbr>")}</a>'
 
     def said(text: str) -> str:
-        lines = re.sub(r"results/([\w./-]*\w)", link, escape(text)).splitlines()
+        kept = re.sub(r"(?<=\d) (?=(mm|cm|m|m²|scene units|%|°)(?!\w))", "\u00a0", escape(text))
+        lines = re.sub(r"results/([\w./-]*\w)", link, kept).splitlines()
         return lines[0] if len(lines) == 1 else f"<ul>{''.join(f'<li>{line}</li>' for line in lines)}</ul>"
 
     return f"<dl>{''.join(f'<div><dt>{label}</dt><dd>{said(text)}</dd></div>' for label, text in facts.items())}</dl>"

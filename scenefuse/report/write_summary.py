@@ -24,6 +24,7 @@ from scenefuse.report.facts import (
     of_cameras,
     photographed,
     scene_facts,
+    verdict,
 )
 from scenefuse.report.forecast import FORECAST, read_forecast
 from scenefuse.report.run_summary import ObjectSummary, RunInputs, RunSummary, SceneSummary, summarise, why_missing
@@ -213,7 +214,7 @@ def summary_text(run: RunSummary, tables: dict[str, pd.DataFrame], made: str) ->
     for row in records(tables["scenes"]):
         lines += ["", f"scene {row['scene']}", *_fact_lines(scene_facts(row), most=2)]
     for row in records(tables["objects"]):
-        lines += ["", f"object {row['object']}: {row['status']}", *_fact_lines(object_facts(row), most=2)]
+        lines += ["", f"object {row['object']}: {verdict(row)}", *_fact_lines(object_facts(row), most=2)]
     if run.failed:
         lines += ["", "jobs that failed", *(line for job in run.failed for line in _line("", job))]
     more = "details.txt says what the stages measured and chose; report.html shows it all."

@@ -300,7 +300,8 @@ def _sheet(
     axes.set_title(f"{title} ({unit})", fontsize=10)
     bar = round_below(width / 2)
     left, low = (1 - size[0]) / 2, (1 - size[1]) / 2 - 0.05
-    figure.add_artist(Line2D([left, left + bar * page_per_unit / PAGE[0]], [low, low], color="black", linewidth=4))
+    ends = [left, left + bar * page_per_unit / PAGE[0]], [low, low]
+    figure.add_artist(Line2D(*ends, color="black", linewidth=4, solid_capstyle="butt"))
     figure.text(left, low + 0.01, f"{bar:g} {unit}", fontsize=8)
     figure.text(left, low - 0.02, f"purple: interpolated; grey: not measured; drawn {date.today()}", fontsize=8)
     if crs is not None:

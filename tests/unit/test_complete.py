@@ -302,3 +302,14 @@ def test_an_error_in_settings_names_its_file_and_line(tmp_path, text, sentence):
     (tmp_path / "mine.yaml").write_text(text)
     with pytest.raises(StageError, match=f"mine.yaml,? ?{sentence}".replace(",? ? is", " is")):
         read_differences(tmp_path / "mine.yaml")
+
+
+def test_a_job_that_fails_is_told_at_once_with_its_error(tmp_path, capsys):
+    log = tmp_path / "results/logs/import_object_cloud/ten.log"
+    log.parent.mkdir(parents=True)
+    log.write_text("python import_object_cloud.py\nerror: ten.xyz has only 10 points\n")
+    complete.report_step(tmp_path, "Logfile results/logs/import_object_cloud/ten.log:", 0.0, 2)
+    assert capsys.readouterr().out.endswith(f" ten failed: ten.xyz has only 10 points [{log}]\n")
+    log.write_text("python import_object_cloud.py\n")
+    complete.report_step(tmp_path, "Logfile results/logs/import_object_cloud/ten.log:", 0.0, 2)
+    assert "ended without a message" in capsys.readouterr().out

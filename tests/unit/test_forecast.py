@@ -92,7 +92,7 @@ def test_a_line_says_when_the_disk_is_too_small_and_a_run_that_cannot_fit_is_ref
     (house / "cloud.ply").write_bytes(bytes(5 * 10**6))
     note = lines({house: 10**6, dragon: int(1.2 * free), film: None})[-1]
     assert "(5 MB now)" in note and "too little" in note
-    assert len(lines({film: None})) == 2 and "not counted, for no photos are there: film" in lines({film: None})[0]
+    assert len(lines({film: None})) == 2 and "without those that have no photos: film" in lines({film: None})[0]
 
 
 def test_time_and_memory_are_said_with_the_steps_that_take_most(tmp_path):

@@ -163,10 +163,10 @@ def test_a_scene_of_kilometres_fills_its_view(browser, page):
 def test_every_way_of_colouring_changes_the_picture_and_has_its_legend(opened):
     pictures = {}
     for mode, words in {
-        "Colours": "The points' own colours",
+        "Photos": "The colours of the photos",
         "Source": "added",
-        "Class": "not measured: of the NeRF, or a given cloud",
-        "Std. deviation": "0.049 m",
+        "Class": "not measured: from the NeRF or a given cloud",
+        "Std. deviation": "49.0 mm",
     }.items():
         choose(opened, mode)
         pictures[mode] = opened.picture(STAGE)
@@ -199,6 +199,8 @@ def test_the_surface_is_shown_with_photos_class_and_deviation_beside_the_points(
     write_json(house / "surface.json", surface_report(surface, "m"))
     browser.open(report(tmp_path, {"house": view_of(before, completed(before, added, deviation=deviation))}))
     ready(browser)
+    assert "photos on the mesh" in browser.find(f"{SECTION} .view-legend").text  # it is shown first
+    choose(browser, "After")
     choose(browser, "Source")
     choose(browser, "Surface")
     browser.value("await new Promise((next) => setTimeout(next, 400));")
@@ -233,7 +235,7 @@ def test_the_surface_is_shown_with_photos_class_and_deviation_beside_the_points(
 
 def test_colours_whose_fields_are_absent_are_not_offered(opened):
     labels = opened.find("[aria-label='3D view of shed'] .colour").text
-    assert "Colours" in labels and "Source" in labels
+    assert "Photos" in labels and "Source" in labels
     assert "Class" not in labels and "deviation" not in labels
 
 
@@ -388,7 +390,7 @@ def test_a_clients_questions_are_answered_by_the_first_screens(tmp_path, phone, 
         window.open(page)
         shown = [text for at, text in window.value(SHOWN) if at <= screens]
         assert window.complaints() == []
-    said = "\n".join(shown)
+    said = "\n".join(shown).replace("\u00a0", " ")
     assert [question for question, answer in QUESTIONS.items() if not re.search(answer, said, re.IGNORECASE)] == []
 
 

@@ -324,7 +324,7 @@ def test_stations_are_named_by_where_they_stand_if_north_is_known(capture, tmp_p
     table.write_text(plain)
     assert [label for label in labels if "station 1" in label] == [
         "from station 1, 4.03 m away",
-        "from station 1, 4.03 m to the east",
+        "from station 1, 4.03 m east of it",
     ]
 
 
