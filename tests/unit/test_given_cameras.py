@@ -255,10 +255,17 @@ def test_cameras_without_the_shape_of_their_photos_are_tried_as_of_stored_ones_t
     assert f"they are taken as {'stored' if quarters else 'upright'}, whose matches" in value(report, "notes")[-1]
 
 
-def test_a_turned_lens_bends_as_before():
-    camera = pycolmap.Camera(
-        model="OPENCV", width=400, height=300, params=[500, 510, 190, 160, 0.1, -0.05, 0.01, -0.02]
-    )
+@pytest.mark.parametrize(
+    ("lens", "bent"),
+    [
+        ("OPENCV", [0.1, -0.05, 0.01, -0.02]),
+        ("THIN_PRISM_FISHEYE", [0.1, -0.05, 0.01, -0.02, 0.01, 0.02, 0.03, -0.04]),
+        ("FOV", [0.6]),
+        ("EUCM", [0.6, 1.1]),
+    ],
+)
+def test_a_turned_lens_bends_as_before(lens, bent):
+    camera = pycolmap.Camera(model=lens, width=400, height=300, params=[500, 510, 190, 160, *bent])
     before = PosedPhoto("a", Path("a.jpg"), camera, np.eye(4), None, False)
     after = stood_upright(before, 1)
     rays = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 3)) + [0, 0, 1]
@@ -266,9 +273,9 @@ def test_a_turned_lens_bends_as_before():
     turned = after.camera.img_from_cam(rays @ np.linalg.inv(after.object_from_cam)[:3, :3].T)
     np.testing.assert_allclose(turned, np.stack([300 - pixels[:, 1], pixels[:, 0]], axis=1), atol=1e-9)
     assert (after.camera.width, after.camera.height) == (300, 400)
-    bent = pycolmap.Camera(model="THIN_PRISM_FISHEYE", width=400, height=300, params=[500, 500, 200, 150, *[0.0] * 8])
-    with pytest.raises(StageError, match=r"a\.jpg is rotated by EXIF, and its camera, a THIN_PRISM_FISHEYE, cannot"):
-        stood_upright(replace(before, camera=bent), 1)
+    name, params = "RAD_TAN_THIN_PRISM_FISHEYE", [500, 500, 200, 150, *[0.0] * 12]
+    with pytest.raises(StageError, match=rf"a\.jpg is rotated by EXIF, and its camera, a {name}, cannot be turned"):
+        stood_upright(replace(before, camera=pycolmap.Camera(model=name, width=400, height=300, params=params)), 1)
 
 
 def test_wrong_cameras_are_named(tmp_path):

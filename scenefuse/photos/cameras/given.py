@@ -27,7 +27,7 @@ FROM_STORED = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 
 # OpenCV axes from those of OpenGL and Bundler: x right, y up, looking along -z.
 FLIP = np.diag([1.0, -1.0, -1.0])
 # Parameters of a lens that a turn leaves as they are.
-EVEN = ("f", "k", "k1", "k2", "k3", "k4", "k5", "k6")
+EVEN = ("f", "k", "k1", "k2", "k3", "k4", "k5", "k6", "omega", "alpha", "beta")
 
 Size = tuple[int, int]
 SizeOf = Callable[[Path], Size]
@@ -181,8 +181,10 @@ def turned(lens: pycolmap.Camera, quarters: int, name: str) -> pycolmap.Camera:
         new |= {"cx": old.height - own["cy"], "cy": own["cx"]}
         if "fx" in own:
             new |= {"fx": own["fy"], "fy": own["fx"]}
-        if "p1" in own:
+        if "p2" in own:
             new |= {"p1": own["p2"], "p2": -own["p1"]}
+        if "sx1" in own:
+            new |= {"sx1": -own["sy1"], "sy1": own["sx1"]}
         if set(new) != set(own):
             raise StageError(
                 f"{name} is rotated by EXIF, and its camera, a {old.model.name}, cannot be turned along;"
