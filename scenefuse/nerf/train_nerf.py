@@ -43,6 +43,8 @@ class TrainingOptions:
 
 
 AS_SHIPPED = TrainingOptions()
+# What a run replaces in its folder.
+FOLDERS = ("undistorted", "masks", "nerf")
 
 
 def train_nerf(
@@ -108,9 +110,16 @@ def train_nerf(
 
 
 def _clear(out: Path) -> None:
-    """Remove the results of an earlier run, so that none of them can be taken for this one's."""
+    """Remove the results of an earlier run, so that none of them can be taken for this one's.
+
+    Raises:
+        StageError: the folder is a file, or holds folders of somebody else that would be replaced.
+    """
     if out.exists() and not out.is_dir():
         raise StageError(f"--out {out} is a file; give a folder")
+    others = [] if (out / "steps/photos.json").exists() else [f for f in FOLDERS if (out / f).exists()]
+    if others:
+        raise StageError(f"--out {out} holds {others[0]}/, which a run would replace; give another folder")
     for old in ("report.json", "object.ply", "renders.png"):
         (out / old).unlink(missing_ok=True)
 

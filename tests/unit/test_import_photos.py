@@ -490,6 +490,14 @@ def test_wrong_flags_are_one_sentence(tmp_path, monkeypatch, options, words):
     assert not Path("out").exists()
 
 
+def test_masks_of_a_user_are_not_replaced(tmp_path):
+    data = nerfstudio(tmp_path / "in")
+    before = sorted(path.read_bytes() for path in (data / "masks").iterdir())
+    with pytest.raises(StageError, match="in holds masks/, which a run would replace"):
+        train_nerf(data=data, out=data)
+    assert sorted(path.read_bytes() for path in (data / "masks").iterdir()) == before
+
+
 @pytest.mark.skipif(not LEGO.is_dir(), reason="only where the Lego photos are")
 def test_lego_masks_agree_on_a_hull(tmp_path):
     views, _ = imported(LEGO, tmp_path)
