@@ -129,7 +129,8 @@ def around_marks(marks: Array, settings: CropSettings, extents: float = 1.0) -> 
     It is as wide as the marks' box, its margin, and so many of its diagonals on each side, and of any height.
     """
     low, high = marks.min(0), marks.max(0)
-    reach = (settings.margin + extents) * float(np.linalg.norm(high - low)) * np.array([1, 1, np.inf])
+    across = (settings.margin + extents) * float(np.linalg.norm(high - low))
+    reach = np.array([across, across, np.inf])
     return low - reach, high + reach
 
 
@@ -272,8 +273,8 @@ def crop_marked(
     Raises:
         StageError: fewer than four fiducials, one far from every scene point, or too few points in the box.
     """
-    if len(fiducials) < MIN_FIDUCIALS:
-        raise StageError(f"{path} gives {len(fiducials)} fiducials; an object needs at least 4 different points on it")
+    if (different := len(np.unique(fiducials, axis=0))) < MIN_FIDUCIALS:
+        raise StageError(f"{path} gives {different} fiducials; an object needs at least 4 different points on it")
     _check_near(names, fiducials, scene, path)
     cut = crop_cloud(scene, fiducials, up, settings)
     _announce(cut, str(path))

@@ -13,7 +13,7 @@ from scenefuse.cloud.cloud_file import CloudFile
 from scenefuse.cloud.clouds import MAX_STEP, Cloud, spacing
 from scenefuse.cloud.import_cloud import unit_and_name
 from scenefuse.cloud.readers.columns import AT_ONCE, COLOR
-from scenefuse.cloud.readers.las import las_crs
+from scenefuse.cloud.readers.las import LAS_DIMENSIONS, las_crs
 from scenefuse.cloud.tiled_cloud import ROW_OF_TILE, Rows
 from scenefuse.cloud.write_las import LAS_DESCRIPTIONS, finer, las_writer
 from scenefuse.core.settings import build, read_settings
@@ -84,9 +84,10 @@ def complete(
     if near.colors is None and obj.colors is not None:
         notes.append("the scene has no colours: the completed scene leaves out the object's, object_in_scene has them")
     known = set(fused.added.fields) | {"source"} if was_completed(near) else set()
-    left_out = sorted({*near.fields, *obj.fields} - known)
-    if left_out:
-        notes.append(f"completed.ply leaves out the columns {', '.join(left_out)}")
+    of_scene, of_object = near.fields.keys() - known - LAS_DIMENSIONS.keys(), obj.fields.keys() - known
+    for whose, left_out in (("scene", of_scene), ("object", of_object)):
+        if left_out:
+            notes.append(f"completed.ply leaves out the {whose}'s columns {', '.join(sorted(left_out))}")
     source = scene.last + 1 if was_completed(near) else Source.OBJECT
     changes, added = fused.changes(rows), with_source(fused.added, source)
     after = together(changes.left_of(rows, near), added)

@@ -21,7 +21,7 @@ from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, estimates, prior
 from scenefuse.register.refinement import Outcome, refine_hypotheses
-from scenefuse.register.register_object import pose_quantities
+from scenefuse.register.register_object import pose_quantities, rests_on
 from scenefuse.register.score import DISTINCT_SHIFT, AgreementSettings, Hypothesis, lead, registration_metrics
 from scenefuse.two_clouds.places import MAX_PLACES, likely_places
 
@@ -207,7 +207,8 @@ def find_in_scene(
 
     It is searched in the whole scene, as if that showed little else, and in each of `likely_places`; the best coarse
     poses are refined. The best has to lead over those elsewhere as over other poses. Scale, coarse and fine
-    registration and the gate are those of the workflow.
+    registration and the gate are those of the workflow. Where that finds nothing, and most of the object's normals
+    face its middle, as on a mesh turned inside out, it is searched again with their sides estimated.
 
     Args:
         obj: the object, any frame and unit.
@@ -239,6 +240,14 @@ def find_in_scene(
     found, part = max(tried, key=lambda one: (one[0].registered, one[0].total))
     if len(tried) > 1:
         found = _unless_elsewhere(found, [other for other, _ in tried], obj, settings.fine)
+    inward = None if obj.normals is None else ((obj.points - obj.points.mean(0)) * obj.normals).sum(1) < 0
+    if not found.registered and inward is not None and inward.mean() > 0.5:
+        other = find_in_scene(
+            replace(obj, normals=None), scene, settings, seed,
+            ups=ups, up_in_scene=up_in_scene, scales=scales, unit=unit, marked=marked,
+        )  # fmt: skip
+        if other[0].registered:
+            return other
     ranked = sorted((one for one in tried if one[1] is not scene), key=lambda one: -one[0].total)
     places = [(one.total, np.stack([there.points.min(0), there.points.max(0)])) for one, there in ranked]
     return with_agreement(found, obj, part, settings, seed), part, places
@@ -361,14 +370,13 @@ def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, An
     return content
 
 
-def evidence_of(cloud: Cloud, scene: Cloud, ups: tuple[Array, Array] | None) -> str:
+def evidence_of(found: Registration, ups: tuple[Array, Array] | None) -> str:
     """What a decision without photos rests on."""
-    colors = cloud.colors is not None and scene.colors is not None
-    known = ["shape", *(["colours"] if colors else []), *(["gravity"] if ups is not None else [])]
-    return f"the clouds alone, by {', '.join(known)}"
+    by = ["shape"] if found.outcome is None else rests_on(found.outcome.ranked[0], Constraints(ups))
+    return f"the clouds alone, by {', '.join(by)}"
 
 
-def summary(found: Registration, searched: str, ups: tuple[Array, Array] | None, evidence: str) -> list[str]:
+def summary(found: Registration, searched: str, ups: tuple[Array, Array] | None) -> list[str]:
     """The decision in five lines."""
     lines = [f"{'registered' if found.registered else 'unregistered'}: {found.reason}"]
     low, high = found.scales.clamp(0.0), found.scales.clamp(np.inf)
@@ -377,7 +385,7 @@ def summary(found: Registration, searched: str, ups: tuple[Array, Array] | None,
         "" if found.scene_from_object is None else f"{found.scene_from_object.scale:.6g} {found.unit} per object unit, "
     )
     lines.append(f"scale      {scale}{held}")
-    lines.append(f"evidence   {evidence}")
+    lines.append(f"evidence   {evidence_of(found, ups)}")
     lines.append(f"searched   {searched}; gravity {'known' if ups is not None else 'not known'} on both sides")
     if found.agreement:
         near, back, rmse, share, tau = (

@@ -119,7 +119,9 @@ def _views(obj: Surface) -> Iterator[Surface]:
     yield obj
     for axis in np.linalg.svd(obj.points - obj.points.mean(0), full_matrices=False)[2]:
         for side in (axis, -axis):
-            yield Surface(obj.points, obj.normals, obj.colors, obj.tree, np.flatnonzero(obj.normals @ side > 0))
+            facing = np.flatnonzero(obj.normals @ side > 0)
+            if len(facing) > 1:  # a plane has no other sides
+                yield Surface(obj.points, obj.normals, obj.colors, obj.tree, facing)
 
 
 def _signature(surface: Surface, seed: int) -> tuple[Array, Array | None]:

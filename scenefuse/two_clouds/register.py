@@ -13,7 +13,7 @@ import tyro
 from scenefuse.cloud.cloud_file import CloudFile, without_strays
 from scenefuse.cloud.clouds import Cloud, has_unit_normals, write_cloud
 from scenefuse.cloud.import_cloud import unit_and_name
-from scenefuse.cloud.readers.las import las_crs
+from scenefuse.cloud.readers.las import las_crs, las_dimensions
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.settings import ROOT
 from scenefuse.core.stage import StageError, atomic_file, quantity, value, write_json
@@ -105,6 +105,7 @@ def register(
         seed: of all random choices; the config's if not given.
     """
     settings, shipped_seed = RegistrationSettings.read(config)
+    command = _command(object, scene, out, format, bool(fuse), known, config, seed)
     seed = shipped_seed if seed is None else seed
     known.check()
     scales = known.scales()
@@ -126,10 +127,9 @@ def register(
     if not marked:
         searched = f"{given.searched}, and the parts of it that look like the object"
         given = replace(given, scene=replace(given.scene, part=part), searched=searched)
-    evidence = evidence_of(given.object, given.scene.part, given.ups)
     points = {"object_points": len(given.object), "scene_points": given.scene.summary.count}
     content = report(found, given.ups) | {
-        "evidence": quantity(evidence, ""),
+        "evidence": quantity(evidence_of(found, given.ups), ""),
         "searched": quantity(given.searched, ""),
         "inputs": quantity({"object": object, "scene": scene} | points, ""),
         "seed": quantity(seed, ""),
@@ -140,7 +140,7 @@ def register(
         advice = f"draw a box around the object in {out / BOX_PAGE}, which gives the next command"
         content["next"] = quantity(f"{advice}; {ROOT}/docs/register.md lists causes", "")
         content["places"] = quantity([{"score": score, "crop_box": box.ravel()} for score, box in places], unit)
-    print("\n".join(summary(found, given.searched, given.ups, evidence)), flush=True)
+    print("\n".join(summary(found, given.searched, given.ups)), flush=True)
     if not found.registered:
         for score, box in places:
             print(f"place      score {score:.2f}  --crop-box {_corners(box)}", flush=True)
@@ -149,7 +149,6 @@ def register(
     if not found.registered:
         written.append(out / BOX_PAGE)
         shown = CloudFile.of(scene, most=MAX_SEARCHED_POINTS).part if marked else whole
-        command = _command(object, scene, out, bool(fuse), known, config)
         write_box_page(written[-1], shown, known.ups()[1], [box for _, box in places], command)
     if fuse:
         written += _fuse(out, given, found, content, known, config)
@@ -160,10 +159,14 @@ def register(
     return ExitStatus.REGISTERED if found.registered else ExitStatus.UNREGISTERED
 
 
-def _command(object: Path, scene: Path, out: Path, fuse: bool, known: Known, config: Path | None) -> str:
+def _command(
+    object: Path, scene: Path, out: Path, format: str, fuse: bool, known: Known, config: Path | None, seed: int | None
+) -> str:
     """What was typed, without what marked a part of the scene."""
     words = ["scenefuse", "register", "--object", object, "--scene", scene, "--out", out, *["--fuse"] * fuse]
+    words += [] if format == "ply" else ["--format", format]
     words += [] if config is None else ["--config", config]
+    words += [] if seed is None else ["--seed", seed]
     for name in ("up_object", "up_scene", "scale", "scale_range"):
         if (given := getattr(known, name)) is not None:
             words += [f"--{name.replace('_', '-')}", *np.atleast_1d(given)]
@@ -207,6 +210,8 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
 
         check_place(crs, whole.summary.sample, scene)
     notes = [*cloud.notes, *strays, *whole.notes, *_notes(object, scene)]
+    if unused := las_dimensions(object):
+        notes.append(f"what is written leaves out of {object} the dimensions {', '.join(unused)}")
     if whole.every > 1:
         notes.append(f"the part to look in is large: one in {whole.every} of its points is searched")
     if box is not None and not len(whole.part):

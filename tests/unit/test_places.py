@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.planted import plant_wide
 
+from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import UP, Sim3
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.geometry.icp import ScaleRange
@@ -92,6 +93,15 @@ def test_an_object_that_fits_two_places_is_refused(monkeypatch, yard):
     assert chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.79, near))[0].registered
 
 
+def test_an_object_turned_inside_out_is_searched_again_without_the_sides_of_its_normals(monkeypatch, yard):
+    monkeypatch.setattr(register, "search", lambda obj, *known: tried(0.8, [0, 0, 0], obj.normals is None))
+    monkeypatch.setattr(register, "refined", lambda found, *known: found)
+    monkeypatch.setattr(register, "with_agreement", lambda found, *known: found)
+    for side, found in ((-1, True), (1, False)):
+        obj = replace(yard.object, normals=side * yard.object.normals)
+        assert find_in_scene(obj, yard.scene, LITTLE, 0, marked=True)[0].registered == found
+
+
 def test_an_object_that_fits_nowhere_may_not_be_there(monkeypatch, yard):
     found, _, _ = chosen(
         monkeypatch,
@@ -110,6 +120,12 @@ def test_places_are_ranked_by_their_scores_each_with_its_box(monkeypatch, yard):
     assert [score for score, _ in places] == [0.3, 0.2]
     points = yard.scene.points[300:600]
     assert np.array_equal(places[0][1], [points.min(0), points.max(0)])
+
+
+def test_a_plane_has_two_sides(yard):
+    flat = Cloud(np.random.default_rng(0).uniform(0, 5, (3000, 3)) * [1, 1, 0])
+    with np.errstate(all="raise"):
+        likely_places(flat, yard.scene, UP, CropSettings(), 0, 1)
 
 
 def test_a_scene_without_a_raised_part_has_no_place(yard):

@@ -75,6 +75,15 @@ def test_a_note_says_that_the_object_s_own_crs_is_not_used(tmp_path, house, caps
     assert note in capsys.readouterr().out
 
 
+def test_colours_are_evidence_only_where_they_were_compared(tmp_path, house, monkeypatch):
+    white = replace(house.scene, colors=np.full_like(house.scene.colors, 255))
+    write_cloud(tmp_path / "house.ply", house.object)
+    write_cloud(tmp_path / "scene.ply", white)
+    registered_at_once(monkeypatch, house.scene_from_object)
+    assert register(object=tmp_path / "house.ply", scene=tmp_path / "scene.ply", out=tmp_path / "out") == 0
+    assert value(read_json(tmp_path / "out/transform.json"), "evidence") == "the clouds alone, by shape"
+
+
 def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path, monkeypatch):
     monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
     trial = plant("house", 5, noise=0.005, object_points=3000, density_ratio=1.0)
@@ -167,6 +176,7 @@ def test_a_column_with_a_space_in_its_name_is_written(tmp_path, house, monkeypat
         ({"up_scene": (0.0, 0.0, 0.0)}, "needs a direction"),
         ({"crop_box": (90.0, 90.0, 90.0, 91.0, 91.0, 91.0)}, "crop box; .* lies from about .* to .* in scene.ply"),
         ({"fiducials": Path("three.txt")}, "at least 4"),
+        ({"fiducials": Path("same.txt")}, "gives 1 fiducials; .* at least 4 different points"),
         ({"fiducials": Path("far.txt")}, "nearest scene point"),
         ({"fiducials": Path("clicks.tsv")}, "clicks in photos"),
         (
@@ -193,6 +203,7 @@ def test_bad_input_is_one_sentence(tmp_path, monkeypatch, house, options, words)
     write_cloud(Path("line.ply"), Cloud(np.outer(np.arange(500.0), [1, 2, 3])))
     Path("three.txt").write_text("0 0 0\n1 0 0\n0 1 0\n")
     np.savetxt("far.txt", np.eye(4, 3) + 1000)
+    np.savetxt("same.txt", np.ones((4, 3)))
     Path("clicks.tsv").write_text("point\tphoto\tx_px\ty_px\na\tb.jpg\t1\t1\n")
     Path("typo.yaml").write_text("registration: {fine: {max_scale_sd: 0.1}}")
     files = {"object": Path("scene.ply"), "scene": Path("scene.ply")}

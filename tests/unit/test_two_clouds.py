@@ -252,17 +252,30 @@ def test_a_scan_that_was_merged_twice_is_completed_as_once_and_is_said_to_be(tmp
 
 def test_columns_that_the_object_lacks_are_named_and_a_grey_object_is_said_to_be(tmp_path, capsys):
     scene, obj = in_scene(sheet(0, 4)), Cloud(sheet(2, 8).points)
-    scene.fields["height"] = scene.points[:, 2]
+    scene.fields["height"] = scene.fields["intensity"] = scene.points[:, 0]
     write_cloud(tmp_path / "yard.ply", scene)
     scene = CloudFile.of(tmp_path / "yard.ply")
     done = complete(own(obj), scene, POSE, FusionSettings())
     written = write_files(tmp_path, done, tmp_path / "shed.ply", scene)
     assert [path.name for path in written] == ["completed.ply", "completed.json"]
     notes, printed = value(read_json(written[-1]), "notes"), capsys.readouterr().out
-    for words in ("leaves out the columns height", "grey in the scene", "neither side has photos"):
+    for words in ("leaves out the scene's columns height", "grey in the scene", "neither side has photos"):
         assert any(words in note for note in notes) and words in printed
     added = read_cloud(written[0])
     assert (added.colors[added.fields["source"] == 1] == 128).all()
+    # What LAS has a place for stays.
+    assert not any("intensity" in note for note in notes) and added.fields["intensity"].max() > UTM[0]
+
+
+def test_what_a_las_says_of_the_object_beside_its_colours_is_named_where_it_is_left_out(tmp_path, house, monkeypatch):
+    write_survey(tmp_path / "house.laz", house.object)
+    write_cloud(tmp_path / "yard.ply", house.scene)
+    registered_at_once(monkeypatch, house.scene_from_object)
+    out = tmp_path / "out"
+    assert register(object=tmp_path / "house.laz", scene=tmp_path / "yard.ply", out=out, format="laz") == 0
+    assert "height" in laspy.read(out / "object_in_scene.laz").point_format.dimension_names
+    notes = value(read_json(out / "transform.json"), "notes")
+    assert any(note.endswith("house.laz the dimensions intensity, classification") for note in notes), notes
 
 
 def test_an_object_beyond_the_coordinates_of_a_las_file_is_one_sentence(tmp_path):
@@ -336,12 +349,13 @@ def test_a_refusal_ends_in_places_whose_boxes_can_be_pasted(tmp_path, house, mon
     for name, cloud in (("house", house.object), ("yard", house.scene)):
         write_cloud(tmp_path / f"{name}.ply", cloud)
     known = {"object": tmp_path / "house.ply", "scene": tmp_path / "yard.ply", "out": tmp_path / "out"}
-    assert register(**known) == 3
+    assert register(**known, format="laz", seed=7) == 3
     said = capsys.readouterr().out
     box = tuple(map(float, re.search(r"^place +score 0\.00  --crop-box (.*)$", said, re.MULTILINE)[1].split()))
     points = house.scene.points[rows]
     np.testing.assert_allclose(box, [*points.min(0), *points.max(0)], atol=1e-3 * np.ptp(points, axis=0).max())
     assert f"draw a box around the object in {tmp_path / 'out/crop_box.html'}" in said
+    assert "--format laz --seed 7" in (tmp_path / "out/crop_box.html").read_text()
     written = value(read_json(tmp_path / "out/transform.json"), "places")
     assert len(written) == 1 and len(written[0]["crop_box"]) == 6
     assert register(**known, known=Known(crop_box=box)) == 3
