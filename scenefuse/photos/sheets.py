@@ -72,7 +72,7 @@ def draw_scale(axes: Any, px_per_unit: float, unit: str, has_north: bool, at_rig
     bar, box = round_below(right / px_per_unit / 4), {"color": "white", "alpha": 0.7, "pad": 1}
     start = 0.96 * right - bar * px_per_unit if at_right else 0.04 * right
     ends = [start, start + bar * px_per_unit], [0.96 * low] * 2
-    axes.plot(*ends, color="black", linewidth=3, solid_capstyle="butt", zorder=5)
+    axes.plot(*ends, color="black", linewidth=3, solid_capstyle="butt", zorder=6)
     axes.text(start, 0.94 * low, f"{bar:g} {unit}", zorder=5, bbox=box)
     if has_north:
         arrow = {"arrowstyle": "-|>", "color": "black"}

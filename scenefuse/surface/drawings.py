@@ -202,13 +202,11 @@ def draw_surface(
                 shown = None if painted is None else replace(painted, points=frame.in_crs(painted.points) - shift)
             drawing = draw(drawn, shown, axes, ratio * pixel_of(whole, painted))
             _write_bands(output / side, drawing, crs, shift)
-            azimuth = (
-                "" if side == "above" else f", looking {np.degrees(np.arctan2(-axes[2, 0], -axes[2, 1])) % 360:.1f}°"
-            )
+            towards = f", looking towards {np.degrees(np.arctan2(-axes[2, 0], -axes[2, 1])) % 360:.0f}°"
             scale = _scale(drawing, metres / ratio)
-            where = {"above": "from above", "facade": "facade"}.get(side, f"from the {side}")
-            title = f"{name} {where}{azimuth}"
-            title += f"; 1:{scale}" if unit != "scene units" else ""
+            where = {"above": "plan", "facade": "facade"}.get(side, f"elevation from the {side}")
+            title = f"{name}, {where}{'' if side == 'above' else towards}"
+            title += f"; 1:{scale} on A3" if unit != "scene units" else ""
             left = drawing.left + shift[0] if side == "above" else 0.0
             corner = (left, drawing.top + shift[1])
             figure = _sheet(drawing, title, counted, metres / ratio / scale, corner, crs)
