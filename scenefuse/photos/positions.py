@@ -65,14 +65,14 @@ def stated_position(gps: Mapping[int, Any], xmp: bytes) -> tuple[Position, str]:
     problems = []
     for north, north_of, east, east_of in (by_exif, (latitude, None, longitude, None)):
         if north is not None or east is not None:
-            place, problem = place_of(north, north_of, east, east_of)
+            place, problem = degrees_of(north, north_of, east, east_of)
             if place is not None:
                 return Position(*place, height, *rtk_accuracy(xmp)), problem
             problems.append(problem)
     return Position(), problems[0] if problems else ""
 
 
-def place_of(north: Any, north_of: Any, east: Any, east_of: Any) -> tuple[tuple[float, float] | None, str]:
+def degrees_of(north: Any, north_of: Any, east: Any, east_of: Any) -> tuple[tuple[float, float] | None, str]:
     """Latitude and longitude in degrees, None where they are useless; and why, or what was assumed.
 
     References of None are those that a format does not have.

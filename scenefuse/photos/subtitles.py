@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from scenefuse.core.transforms import Array
-from scenefuse.photos.positions import Position, place_of
+from scenefuse.photos.positions import Position, degrees_of
 
 NUMBER = r"[-+]?\d+(?:\.\d+)?"
 # From when to when a block is shown: hours, minutes, seconds, of which some drones count 60.
@@ -72,7 +72,7 @@ def _stated(text: str) -> tuple[float, float, float, float]:
         altitude = found[5] if found[6] else None
     if found := HEIGHT.search(text):
         height = found[1]
-    place, _ = place_of(*sides[0], *sides[1])
+    place, _ = degrees_of(*sides[0], *sides[1])
     if place is None:
         return np.nan, np.nan, np.nan, np.nan
     # Some firmware writes radians; read as degrees they would all lie in the sea, in the Gulf of Guinea.

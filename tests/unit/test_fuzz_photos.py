@@ -26,6 +26,7 @@ from scenefuse.photos.cameras.read_cameras import place_of, read_posed_photos
 from scenefuse.photos.photo_files import photos_by_name
 from scenefuse.photos.photos import inspect_photo, save_upright
 from scenefuse.photos.positions import positions_of, read_geo, stated_position
+from scenefuse.photos.subtitles import positions_in_subtitles
 from scenefuse.sfm.features import read_calibration
 
 MAX_SECONDS, MAX_BYTES = 10.0, 2 << 30
@@ -189,6 +190,8 @@ def test_binary_models_of_colmap(folder, edits, cut):
 CLICKS = "point\tphoto\tx_px\ty_px\na\tc.JPG\t3.5\t4\na\ta b.jpg\t5\t6\n"
 LENGTHS = "length\tmetres\tend\tphoto\tx_px\ty_px\nbar\t1.5\ta\tc.JPG\t3\t4\nbar\t1.5\tb\tc.JPG\t5\t6\n"
 CONTROL = "EPSG:32632\n466000 5246000 430 12 13 c.JPG a\n466010 5246000 431 12 13 c.JPG b 0.1\n"
+SUBTITLES = "1\n00:00:00,000 --> 00:00:01,000\n[latitude: 50.1] [longtitude : 8.6] [rel_alt: 1.5 abs_alt: 99.1]\n\n"
+SUBTITLES += "2\n00:00:01,000 --> 00:00:02,000\nHOME(8.7,50.2)\nGPS(8.6101,50.1102,14M) BAROMETER:8.8 H 3.50m\n"
 TABLES = {
     "points.tsv": (CLICKS, read_points),
     "labels.tsv": ("label\tphoto\tx_px\ty_px\ninside\tc.JPG\t3\t4\nbox\tc.JPG\t1\t2\n", read_points),
@@ -199,6 +202,7 @@ TABLES = {
         "EPSG:4326\nc.JPG 8.5 47.5 400 0 0 0 0.1\na b.jpg\t8.6\t47.5\n",
         lambda path: positions_of(["a b.jpg", "c.JPG"], read_geo(path), path),
     ),
+    "flight.srt": (SUBTITLES, lambda path: positions_in_subtitles(path, [0.0, 0.5, 1.5, 9.0])),
     "calibration.txt": (CALIBRATION, read_calibration),
     "scenes.tsv": ('scene\tphotos\tcrs\n"yard"\t~/p\tEPSG:25832\n# no\nb\t\n', lambda path: read_table(path, "scene")),
     "config.yaml": ("object: {nerf: {width_px: 1600}}\nseed: 3\nscenes: a.tsv\n", read_settings),
