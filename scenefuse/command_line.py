@@ -92,10 +92,12 @@ def _settings_files() -> tuple[list[Path], list[str]]:
 
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--configfile", "--configfiles", nargs="+", type=Path, default=[])
-    given = parser.parse_known_args(sys.argv[1:])[0].configfile
+    parser.add_argument("--directory", "-d", type=Path, default=Path())
+    words = parser.parse_known_args(sys.argv[1:])[0]
+    given, file = words.configfile, words.directory / OWN_SETTINGS
     # Snakemake refuses a file without keys, as one is whose only line was commented out.
-    has_own = OWN_SETTINGS.is_file() and re.search(r"^[^#\s]", OWN_SETTINGS.read_text(errors="replace"), re.MULTILINE)
-    own = [OWN_SETTINGS] if has_own and not given else []
+    has_own = file.is_file() and re.search(r"^[^#\s]", file.read_text(errors="replace"), re.MULTILINE)
+    own = [file] if has_own and not given else []
     return given or own, ["--configfile", *map(str, own)] if own else []
 
 

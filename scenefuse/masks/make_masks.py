@@ -104,9 +104,13 @@ def make_masks(
         print(f"{name} left out: {reason}", flush=True)
     kept = [view.name for view in photos.views if view.name not in made.dropped]
     if len(kept) < settings.min_photos:
+        enough = len(photos.views) >= settings.min_photos
+        advice = (
+            "check that the prompts span the object, or supply masks" if enough else "take more photos of the object"
+        )
         raise StageError(
             f"only {len(kept)} of {len(photos.views)} photos in {inputs.workspace} have a good mask,"
-            f" {settings.min_photos} needed: check that the prompts span the object, or supply masks"
+            f" {settings.min_photos} needed: {advice}"
         )
     with atomic_directory(masks) as folder:
         for name in kept:

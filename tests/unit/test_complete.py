@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -249,6 +250,15 @@ def test_run_takes_all_cores_unless_somebody_says_how_many(two_folders, monkeypa
         assert started(monkeypatch, *words) == [*words, *own]
     Path("config/config.yaml").write_text("# gpu: auto\n\n")
     assert started(monkeypatch, "-n") == ["-n", "--cores", "all"]
+
+
+@pytest.mark.parametrize("words", [["--directory", "yard"], ["-d", "yard"], ["--directory=yard"]])
+def test_run_in_another_folder_reads_the_settings_of_the_project_there(two_folders, monkeypatch, words):
+    for name in ("yard", "here"):
+        init(Path(name), scene=Path("flight"))
+    shutil.copytree("here/config", "config")
+    own = ["--configfile", "yard/config/config.yaml"]
+    assert started(monkeypatch, *words) == [*words, *own, "--cores", "all"]
 
 
 def test_the_help_of_run_is_one_screen(monkeypatch, capsys):

@@ -282,7 +282,7 @@ def test_prompts_away_from_the_object_are_an_error(capture, tmp_path):
         run_stage(capture, tmp_path / "x", prompts=prompts)
     with pytest.raises(StageError, match="need a prompts file"):
         run_stage(capture, tmp_path / "x", prompts=None)
-    with pytest.raises(StageError, match="9 needed"):
+    with pytest.raises(StageError, match="9 needed: take more photos"):
         run_stage(capture, tmp_path / "x", min_photos=9)
     assert not (tmp_path / "x").exists()
 
