@@ -106,9 +106,10 @@ def test_a_mask_that_lies_among_the_photos_reruns_the_masks_when_it_changes(plan
     assert "make_masks" not in plan(give) and "make_masks" in plan(give_and_change, place="changed")
 
 
-def test_a_photo_whose_name_holds_braces_is_listed_and_a_change_of_it_is_noticed(plan):
+@pytest.mark.parametrize("name", ["a{1}.jpg", "a<b>.jpg"])
+def test_a_photo_whose_name_snakemake_would_expand_is_listed_and_a_change_of_it_is_noticed(plan, name):
     def add(project):
-        shutil.copy(next((project / "flight").glob("*.jpg")), project / "flight/a{1}.jpg")
+        shutil.copy(next((project / "flight").glob("*.jpg")), project / "flight" / name)
 
     assert "list_photos" in plan(add)
 

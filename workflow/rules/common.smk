@@ -358,9 +358,11 @@ def photos_in(path, where):
 
 
 def as_inputs(files):
-    """Input function: the files of another one whose names hold no brace, which Snakemake would take for a wildcard. `state_of`
-    sees the others as well."""
-    return lambda wildcards: [path for path in files(wildcards) if "{" not in path]
+    """Input function: the files of another one whose names hold neither { nor <, which Snakemake would take for a wildcard or a
+    path variable. `state_of` sees the others as well."""
+    return lambda wildcards: [
+        path for path in files(wildcards) if not set("{<") & set(path)
+    ]
 
 
 def state_of(files):
