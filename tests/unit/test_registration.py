@@ -118,6 +118,20 @@ def test_refinement_recovers_a_disturbed_similarity(house):
     assert abs(scale) < 1 and angle < 1 and shift < 0.005
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_refinement_does_not_depend_on_the_unit_of_the_scene(house, unit):
+    poses = []
+    for factor in (1.0, unit):
+        into, tau = Sim3(factor, np.eye(3), np.zeros(3)), 0.02 * house.diagonal * factor
+        truth = into @ house.scene_from_object
+        trial = replace(house, scene=house.scene.transformed(into), scene_from_object=truth)
+        start = Sim3(1.0, np.eye(3), np.array([0.4 * tau, 0, 0])) @ truth
+        pose = refine_planes(*surfaces(trial, tau / 2), start, ScaleRange(truth.scale, 0.1), tau)
+        poses.append(into.inverse() @ pose)
+    scale, angle, shift = errors(poses[1], poses[0], house.object.points.mean(0), house.diagonal)
+    assert abs(scale) < 0.02 and angle < 0.02 and shift < 2e-4
+
+
 def test_what_the_scene_does_not_show_does_not_shrink_the_object():
     trial = plant("gate", 5, coverage=0.35, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
     truth, tau = trial.scene_from_object, 0.02 * trial.diagonal
