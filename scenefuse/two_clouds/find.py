@@ -220,7 +220,7 @@ def find_in_scene(
         up_in_scene: unit vector (3,), opposite to gravity; None where it is not known.
         scales: scene units per object unit; None to estimate them from both extents.
         unit: what the scene's lengths are counted in, for the report.
-        marked: the points are those of a place that was marked: no parts of it are tried.
+        marked: the points are those around fiducials: no parts of it are tried.
 
     Returns:
         The best registration, the part of the scene that it was found in, and the places where it was tried, the best

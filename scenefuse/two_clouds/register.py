@@ -118,7 +118,8 @@ def register(
         _check_size(scales, given)
     crs = las_crs(scene)
     unit, _ = unit_and_name(crs)
-    marked = known.fiducials is not None or known.crop_box is not None
+    # A box holds the ground and what stands beside the object, too.
+    marked, boxed = known.fiducials is not None, known.crop_box is not None
     whole = given.scene.part
     found, part, places = find_in_scene(
         given.object, whole, settings, seed,
@@ -148,7 +149,7 @@ def register(
     written = _write(out, format, given, found, scene, seed)
     if not found.registered:
         written.append(out / BOX_PAGE)
-        shown = CloudFile.of(scene, most=MAX_SEARCHED_POINTS).part if marked else whole
+        shown = CloudFile.of(scene, most=MAX_SEARCHED_POINTS).part if marked or boxed else whole
         write_box_page(written[-1], shown, known.ups()[1], [box for _, box in places], command)
     if fuse:
         written += _fuse(out, given, found, content, known, config)

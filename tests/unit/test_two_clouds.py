@@ -343,7 +343,7 @@ def test_a_refused_pose_leaves_no_completed_scene_and_nothing_of_an_earlier_run(
 
 
 def test_a_refusal_ends_in_places_whose_boxes_can_be_pasted(tmp_path, house, monkeypatch, capsys):
-    registered_at_once(monkeypatch, house.scene_from_object, registered=False)
+    searched = registered_at_once(monkeypatch, house.scene_from_object, registered=False)
     rows = np.flatnonzero(house.scene.points[:, 0] > np.median(house.scene.points[:, 0]))
     monkeypatch.setattr(register_module, "likely_places", lambda *known: [rows])
     for name, cloud in (("house", house.object), ("yard", house.scene)):
@@ -358,8 +358,11 @@ def test_a_refusal_ends_in_places_whose_boxes_can_be_pasted(tmp_path, house, mon
     assert "--format laz --seed 7" in (tmp_path / "out/crop_box.html").read_text()
     written = value(read_json(tmp_path / "out/transform.json"), "places")
     assert len(written) == 1 and len(written[0]["crop_box"]) == 6
+    # A box holds more than the object: what looks like it there is tried, too.
+    searched.clear()
+    monkeypatch.setattr(register_module, "likely_places", lambda *known: [np.arange(300)])
     assert register(**known, known=Known(crop_box=box)) == 3
-    assert "place " not in capsys.readouterr().out
+    assert len(searched) == 2 and len(searched[1][1]) == 300
 
 
 @pytest.mark.process
