@@ -99,7 +99,7 @@ def refine_planes(
         system, right = rows.system.copy(), rows.right
         if scales.width == 0:
             system[6], system[:, 6], right[6], system[6, 6] = 0, 0, 0, 1
-        step = -np.linalg.solve(system * (1 + 1e-9 * np.eye(7)), right)
+        step = np.asarray(-np.linalg.solve(system * (1 + 1e-9 * np.eye(7)), right), np.float64)
         pose = moved_about(pose, step, rows.centre, scales)
         if _motion(step, rows) < 0.005 * tau:
             break
