@@ -38,8 +38,8 @@ def triangulated(
         options: COLMAP's, of triangulation.
 
     Raises:
-        StageError: what the readers say; cameras of no photo, or of other shape than their photos; photos that share a
-            camera in the database but not here; cameras that do not fit the photos.
+        StageError: what the readers say; cameras of no photo, or of other shape than their photos; cameras that do not
+            fit the photos.
     """
     root, originals, orientations = Path(os.path.abspath(folder)), original_sizes(content), orientations_in(content)
     given, _, notes = read_posed_photos(cameras, folder, lambda file: originals[file.relative_to(root).as_posix()])
@@ -84,15 +84,7 @@ def _model(
         shutil.copyfile(database, calibrated)
         with pycolmap.Database.open(calibrated) as opened:
             images = {image.image_id: posed.get(image.name) for image in opened.read_all_images()}
-            shared: dict[int, PosedPhoto] = {}
-            for image in opened.read_all_images():
-                photo = images[image.image_id]
-                if photo is not None:
-                    own = opened.read_camera(image.camera_id)
-                    _check_same(shared.setdefault(image.camera_id, photo), photo, cameras)
-                    camera = at_size(photo.camera, (own.width, own.height), f"{cameras}: the photo {image.name}")
-                    camera.camera_id, camera.has_prior_focal_length = own.camera_id, True
-                    opened.update_camera(camera)
+            _give_lenses(opened, posed, str(cameras))
             cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
         model = pycolmap.Reconstruction()
         model.load(cache)
@@ -107,11 +99,28 @@ def _model(
         return cancellable(pycolmap.triangulate_points, model, calibrated, folder, scratch / "points", options=options)
 
 
-def _check_same(first: PosedPhoto, photo: PosedPhoto, cameras: Path) -> None:
-    """StageError where photos of one camera in the database have two lenses here."""
-    a, b = first.camera, photo.camera
-    if a.model != b.model or not np.allclose(a.params, b.params):
-        raise StageError(
-            f"{cameras}: {first.file.name} and {photo.file.name} have different lenses, but count as photos of one"
-            " camera; set features.camera_mode to per_photo"
-        )
+def _give_lenses(database: pycolmap.Database, posed: Mapping[str, PosedPhoto], where: str) -> None:
+    """Put the lenses of photos, by name, into a database; photos that share a camera there and not here part."""
+    frame_of = {data.id: frame for frame in database.read_all_frames() for data in frame.image_ids}
+    given: dict[int, dict[tuple[Any, ...], tuple[int, int]]] = {}
+    for image in (image for image in database.read_all_images() if image.name in posed):
+        own = database.read_camera(image.camera_id)
+        camera = at_size(posed[image.name].camera, (own.width, own.height), f"{where}: the photo {image.name}")
+        camera.has_prior_focal_length = True
+        lens, known = (camera.model_name, *camera.params), given.setdefault(own.camera_id, {})
+        if not known:
+            camera.camera_id, known[lens] = own.camera_id, (own.camera_id, 0)
+            database.update_camera(camera)
+        elif lens not in known:
+            number, rig = database.write_camera(camera), pycolmap.Rig()
+            rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number))
+            known[lens] = number, database.write_rig(rig)
+        number, rig_id = known[lens]
+        if number != image.camera_id:
+            image.camera_id, frame = number, frame_of[image.image_id]
+            frame.rig_id = rig_id
+            frame.clear_data_ids()
+            sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number)
+            frame.add_data_id(pycolmap.data_t(sensor, image.image_id))
+            database.update_frame(frame)
+            database.update_image(image)

@@ -26,7 +26,7 @@ from scenefuse.sfm.mapping import MappingSettings, map_photos
 FLIGHT = fly(rows=3, columns=3)
 
 
-def with_database(folder):
+def with_database(folder, views=FLIGHT.views):
     """A database of exact observations and verified matches, and the list of photos; their names and sizes."""
     write_photos(folder / "photos.json", FLIGHT.photos(), folder, "photos", [])
     (folder / "photos").mkdir()
@@ -36,7 +36,7 @@ def with_database(folder):
         rig = pycolmap.Rig()
         rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number))
         rig_id, rows = database.write_rig(rig), []
-        for view in FLIGHT.views:
+        for view in views:
             (folder / "photos" / view.name).write_bytes(b"")
             image = database.write_image(pycolmap.Image(name=view.name, camera_id=number))
             frame = pycolmap.Frame()
@@ -74,11 +74,12 @@ def rational(folder):
     return folder / "given"
 
 
-def nerfstudio(folder):
+def nerfstudio(folder, views=FLIGHT.views):
     frames = []
-    for view in FLIGHT.views:
+    for view in views:
         pose = view.world_from_cam @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": f"photos/{view.name}", "transform_matrix": pose.tolist()})
+        own = {} if views is FLIGHT.views else {"fl_x": view.intrinsics[0, 0], "fl_y": view.intrinsics[1, 1]}
+        frames.append({"file_path": f"photos/{view.name}", "transform_matrix": pose.tolist(), **own})
     lens = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
     (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
     return folder / "transforms.json"
@@ -167,6 +168,22 @@ def test_cameras_of_other_programs_are_taken_as_they_are(tmp_path, write):
     places = np.array([model.points3D[p].xyz for p in sorted(model.point3D_ids())])
     nearest = np.linalg.norm(places[:, None] - FLIGHT.ground[None], axis=2).min(1)
     assert nearest.max() < 1e-3
+
+
+def test_photos_of_one_camera_may_have_lenses_of_their_own(tmp_path):
+    focal = {view.name: FOCAL * (1 + 0.03 * (k % 3)) for k, view in enumerate(FLIGHT.views)}
+    views = [
+        replace(
+            view, intrinsics=np.array([[focal[view.name], 0, WIDTH / 2], [0, focal[view.name], HEIGHT / 2], [0, 0, 1]])
+        )
+        for view in FLIGHT.views
+    ]
+    with_database(tmp_path, views)
+    report, model = mapped(tmp_path, nerfstudio(tmp_path, views))
+    np.testing.assert_allclose(camera_poses(model)[2], FLIGHT.centres, atol=1e-6)
+    found = {image.name: model.cameras[image.camera_id].mean_focal_length() for image in model.images.values()}
+    assert found == pytest.approx(focal) and len(model.cameras) == 3
+    assert value(report, "points") > 150 and value(report, "mean_reprojection_error_px") < 0.01
 
 
 @pytest.mark.parametrize("write", [bundler, nerfstudio])
