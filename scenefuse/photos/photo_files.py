@@ -115,7 +115,7 @@ def photo_files(folder: Path) -> list[Path]:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise StageError(f"the photo folder {folder} does not exist; check its path in the configuration")
+        raise StageError(f"the photos {folder} do not exist; check their path in the configuration")
     files = _files_below(folder)
     photos = [file for file in files if file.suffix.lower() in SUFFIXES]
     readable = {file.with_suffix("") for file in photos}

@@ -61,7 +61,7 @@ def test_weights_are_fetched_only_where_the_masks_may_need_them(project, snakema
 
 
 def test_missing_photo_folder(refused):
-    assert "scenes.tsv, scene 'yard': the photo folder flight does not exist" in refused(
+    assert "scenes.tsv, scene 'yard': the photos flight do not exist" in refused(
         "-n", "results/scenes/yard/photos.json"
     )
 

@@ -137,7 +137,7 @@ def test_a_photo_of_200_megapixels_is_read_and_one_that_no_camera_takes_is_refus
 
 
 def test_missing_and_empty_folders(tmp_path):
-    with pytest.raises(StageError, match="nowhere does not exist"):
+    with pytest.raises(StageError, match="nowhere do not exist"):
         listed(tmp_path, tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "readme.txt").write_text("x")
