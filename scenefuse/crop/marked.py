@@ -36,7 +36,6 @@ from scenefuse.geometry.visual_hull import MAX_BEYOND_POINTS, least_framing
 from scenefuse.marks.clicks import Clicks
 from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
 from scenefuse.mvs.sparse_depths import MASK_REACH_PX, MIN_SHARED_POINTS
-from scenefuse.mvs.stereo_points import FEW_POINTS, with_stereo_points
 from scenefuse.photos.workspace import View, Workspace, read_views, read_workspace, with_mask
 
 # What a click outside lies on is flat where the points around it have at most this surface variation; then it is what
@@ -289,16 +288,19 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
         )
     chosen = np.unique(np.linspace(0, len(files) - 1, min(MAX_PHOTOS, len(files))).round().astype(int))
     found = {files[k][1].name: _with_grown_mask(files[k][1], files[k][0]) for k in chosen}
-    own = _own_points(read, found, min_share)
-    if few := len(own) < MIN_SHARED_POINTS:
+    own, notes = _own_points(read, found, min_share), tuple[str, ...]()
+    if len(own) < MIN_SHARED_POINTS:
+        # Needs PyTorch, which `scenefuse register` does without.
+        from scenefuse.mvs.stereo_points import FEW_POINTS, with_stereo_points
+
         photos = replace(read, views=[read.rgb(view) for view in read.views])
-        own = _own_points(with_stereo_points(photos), found, min_share)
+        own, notes = _own_points(with_stereo_points(photos), found, min_share), (FEW_POINTS,)
     if len(own) < MIN_SHARED_POINTS:
         raise StageError(
             f"only {len(own)} points of {workspace} lie inside the masks of {masks}, by features and by stereo,"
             f" {MIN_SHARED_POINTS} are needed; look at the masks, and take sharper photos of the object"
         )
-    return Masked(list(found.values()), without_strays(own), (FEW_POINTS,) if few else ())
+    return Masked(list(found.values()), without_strays(own), notes)
 
 
 def _own_points(photos: Workspace, masked: dict[str, View], min_share: float) -> Array:
