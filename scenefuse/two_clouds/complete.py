@@ -174,7 +174,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
         described = {name: LAS_DESCRIPTIONS.get(name, "") for name in types}
         header.add_extra_dims([laspy.ExtraBytesParams(names[n], kind, described[n]) for n, kind in types.items()])
         with las_writer(path, header) as writer:
-            brightest, first = 0, 0
+            first = 0
             for chunk in reader.chunk_iterator(AT_ONCE):
                 stay = ~np.isin(np.arange(first, first + len(chunk)), done.removed)
                 first, chunk = first + len(chunk), chunk[stay]
@@ -185,14 +185,11 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
                     if np.abs(chunk.array[axis].astype(np.int64)).max(initial=0) * times > MAX_INTEGER:
                         raise StageError(f"points of {scene.summary.path} lie outside the box it names; write it again")
                     part.array[axis] *= times
-                if "red" in own:
-                    brightest = max(brightest, *(int(np.max(part[name], initial=0)) for name in COLOR))
                 if not again:
                     unknown = with_source(unchecked(Cloud(np.zeros((len(chunk), 3)))), Source.SCENE).fields
                     _fill_in(part, {names[name]: values for name, values in unknown.items()})
                 writer.write_points(part)
-            colors = 1 if 0 < brightest <= 255 else 257
-            writer.write_points(_added_record(header, done, names, colors))
+            writer.write_points(_added_record(header, done, names, scene.summary.white or 0.0))
             if further:
                 writer.write_evlrs(further)
     return [*notes, *(f"in {path.name}, '{name}' is '{other}'" for name, other in names.items() if name != other)]
@@ -245,16 +242,16 @@ def _but_copc(records: Iterable[Any]) -> list[Any]:
     return [record for record in records if record.user_id != "copc"]
 
 
-def _added_record(header: Any, done: Completed, names: dict[str, str], colors: int) -> Any:
-    """The added points as a LAS file's points; a file of 8-bit colours gets those, by the factor `colors`."""
+def _added_record(header: Any, done: Completed, names: dict[str, str], white: float) -> Any:
+    """The added points as a LAS file's points, in whose colours a number is white: 255 in a file of 8 bits."""
     import laspy
 
     record = laspy.ScaleAwarePointRecord.zeros(len(done.added), header=header)
     steps = (done.added.points - header.offsets) / header.scales
     columns: dict[str, NDArray[Any]] = dict(zip(AXES, np.rint(steps).astype(np.int32).T))
     columns |= dict.fromkeys(("return_number", "number_of_returns"), np.ones(len(record), np.uint8))
-    if done.added.colors is not None and "red" in header.point_format.dimension_names:
-        columns |= dict(zip(COLOR, done.added.colors.astype(np.uint16).T * colors))
+    if done.added.colors is not None and done.before.colors is not None:
+        columns |= dict(zip(COLOR, done.added.colors.astype(np.uint16).T * round(white / 255)))
     _fill_in(record, columns | {names[name]: values for name, values in done.added.fields.items()})
     return record
 

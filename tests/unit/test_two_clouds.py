@@ -181,11 +181,14 @@ def test_a_laz_has_finer_steps_where_the_object_asks_for_them_or_says_that_it_ca
 def test_colours_of_8_bits_stay_8_bits(tmp_path, ending):
     scene, obj = in_scene(sheet(0, 4)), sheet(2, 8)
     write_survey(tmp_path / f"yard.{ending}", scene, bright=1)
+    survey = laspy.read(tmp_path / f"yard.{ending}")
+    survey.red[0] = 40_000  # a stray
+    survey.write(tmp_path / f"yard.{ending}")
     scene = CloudFile.of(tmp_path / f"yard.{ending}")
     done = complete(own(obj), scene, POSE, FILL)
     write_files(tmp_path, done, tmp_path / "shed.ply", scene)
     after = laspy.read(tmp_path / "completed.laz")
-    assert after.red.max() <= 255 and after.red[-1] > 100
+    assert after.red[1:].max() <= 255 and after.red[-1] > 100
 
 
 def test_a_completed_scene_takes_further_objects_and_keeps_what_is_known(tmp_path):
@@ -602,6 +605,14 @@ def test_colours_that_the_scene_has_no_place_for_are_named(tmp_path):
     write_cloud(tmp_path / "yard.ply", Cloud(scene.points))
     done = complete(own(sheet(2, 8)), CloudFile.of(tmp_path / "yard.ply"), POSE, FusionSettings(mode="append"))
     assert any("the scene has no colours" in note for note in done.notes)
+
+
+def test_an_object_s_colours_do_not_make_a_scene_black_that_has_none(tmp_path):
+    write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 4, (0, 0, 0))))
+    scene = CloudFile.of(tmp_path / "yard.laz")
+    done = complete(own(sheet(2, 8)), scene, POSE, FILL)
+    write_files(tmp_path, done, tmp_path / "shed.ply", scene)
+    assert len(done.added) and CloudFile.of(tmp_path / "completed.laz").part.colors is None
 
 
 def test_a_folder_that_may_not_be_written_to_stops_at_once(tmp_path, house, monkeypatch):
