@@ -89,8 +89,8 @@ def register(
 ) -> int:
     """Find the place, size and orientation of one point cloud in another, or refuse.
 
-    Reads PLY, LAS, LAZ (COPC too), E57, PCD, XYZ, PTS, TXT, ASC and CSV, and meshes as PLY, OBJ and GLB. Exit status: 0
-    registered, 3 unregistered, 1 bad input. docs/register.md says how to read what it writes.
+    Reads PLY, LAS, LAZ (COPC too), E57, PCD, XYZ, PTS, TXT, ASC and CSV, and meshes as PLY, OBJ and glTF. Exit status:
+    0 registered, 3 unregistered, 1 bad input. docs/register.md says how to read what it writes.
 
     Args:
         object: cloud of the object, in any frame and unit.
