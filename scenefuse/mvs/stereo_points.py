@@ -93,8 +93,11 @@ def _shown(view: View, depth: DepthMap, points: Array) -> Rows:
 
 def with_enough_points(views: Views) -> Views:
     """An object's photos with points by stereo where fewer than MIN_SHARED_POINTS of the sparse ones are on it."""
-    if np.count_nonzero(own_points(views)) >= MIN_SHARED_POINTS:
-        return views
+    return views if np.count_nonzero(own_points(views)) >= MIN_SHARED_POINTS else with_stereo(views)
+
+
+def with_stereo(views: Views) -> Views:
+    """An object's photos with points by stereo beside the sparse ones (`with_stereo_points`)."""
     shown = [views.view(index) for index in range(len(views.names))]
     at = [view.project(views.sparse[rows])[0] for view, rows in zip(shown, views.tracks)]
     more = with_stereo_points(Workspace(Path(), shown, views.sparse, views.tracks, at))

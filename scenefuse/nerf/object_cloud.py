@@ -21,6 +21,7 @@ from scenefuse.geometry.surface import normals_at
 from scenefuse.mvs.dense_cloud import near_others
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.sparse_depths import MASK_REACH_PX, sparse_depths
+from scenefuse.mvs.stereo_points import with_stereo
 from scenefuse.nerf.appearance import without_appearance
 from scenefuse.nerf.rendered_maps import read_nerf
 from scenefuse.photos.pictures import read_depth, read_normals
@@ -147,7 +148,7 @@ def fuse_depths(views: Views, maps: SurfaceMaps, settings: CloudSettings) -> tup
     size = 2 * MASK_REACH_PX + 1
     grown = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((size, size), np.uint8)) > 0 for m in views.masks])
     tolerance = settings.gates.point_agreement * diagonal
-    seen = grown, sparse_depths(views)
+    seen = grown, sparse_depths(with_stereo(views))
     parts = [_confirmed(views, maps, seen, tolerance, index, settings) for index in range(len(points))]
     return concatenate(parts), diagonal
 

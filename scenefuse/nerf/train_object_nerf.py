@@ -17,6 +17,7 @@ from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, quantity, setting, threads, value, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.mvs.sparse_depths import own_points, sparse_depths
+from scenefuse.mvs.stereo_points import with_stereo
 from scenefuse.nerf.appearance import measured_sharpness, photo_weights
 from scenefuse.nerf.field import FieldSettings, kernels_on
 from scenefuse.nerf.rays import SOLID_OPACITY, LossWeights, PhotoTensors
@@ -204,7 +205,8 @@ def _read(inputs: NerfInputs, settings: NerfSettings, hold_out_every: int) -> _G
         earlier = read_nerf(inputs.previous)
         cube = Sim3.from_matrix(earlier["nerf_from_object"].numpy())
     trained = np.flatnonzero(~views.held_out)
-    outlines = silhouettes(views.masks, sparse_depths(views), views.intrinsics, views.object_from_cam, views.sizes)
+    hides = sparse_depths(with_stereo(views))
+    outlines = silhouettes(views.masks, hides, views.intrinsics, views.object_from_cam, views.sizes)
     seen = [outlines[row] for row in trained]
     cells, tolerance = settings.recipe.occupancy_cells, settings.hull_tolerance
     volume = find_volume(seen, cells, tolerance, cube, views.sparse[own_points(views)])

@@ -15,8 +15,9 @@ from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.propagation import NO_CLICKS, propagate
 from scenefuse.masks.votes import known_points, voter_of
-from scenefuse.mvs.sparse_depths import own_points
-from scenefuse.mvs.stereo_points import FEW_POINTS, with_enough_points, with_stereo_points
+from scenefuse.mvs.sparse_depths import own_points, sparse_depths
+from scenefuse.mvs.stereo_points import FEW_POINTS, with_enough_points, with_stereo, with_stereo_points
+from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import Workspace
 
 
@@ -140,3 +141,34 @@ def test_where_stereo_finds_nothing_either_the_error_says_so(bare):
         cv2.imwrite(str(path), np.full((160, 160), 128, np.uint8))
     with pytest.raises(StageError, match="only 0 points of .* by features and by stereo, 8 are needed"):
         marked.read_masked_views(bare, bare / "masks", 0.8)
+
+
+def test_stereo_knows_that_something_without_sparse_points_hides_the_object():
+    """A panel above the disc; no feature was found on it."""
+    height = 0.25
+    photos = photographs(8, 2.0, size=200, radius=1.0, panel=height)
+    rng = np.random.default_rng(0)
+    sparse = np.column_stack([rng.uniform(-1.2, 1.2, (400, 2)), np.zeros(400)])
+    panels, tracks, mattes = [], [], []
+    for view in photos:
+        before = view.centre + (places_of(view) - view.centre) * ((2.0 - height) / 2.0)
+        panels.append((np.abs(before[..., :2]) < 0.12).all(2))
+        rows, pixels, _ = view.visible(sparse)
+        tracks.append(rows[~panels[-1][pixels[:, 1], pixels[:, 0]]])
+        mattes.append(np.uint8(255 * (disc(view) & ~panels[-1])))
+    names, k, poses = (list(map(str, range(8))), [v.intrinsics for v in photos], [v.world_from_cam for v in photos])
+    images = np.stack([np.dstack([view.pixels] * 3) for view in photos])
+    nothing = np.zeros((8, 200, 200), bool)
+    views = Views(
+        names, images, np.stack(mattes), nothing, *map(np.stack, (k, poses)), nothing[:, 0, 0], sparse, tracks
+    )
+
+    def right(depths):
+        found = []
+        for view, panel, depth in zip(photos, panels, depths):
+            true = view.project(view.centre + (places_of(view)[panel] - view.centre) * ((2.0 - height) / 2.0))[1]
+            found.append((np.abs(depth[panel] / true - 1) < 0.05).mean())
+        return min(found)
+
+    # The panel is small, and its rim lies too near the mask.
+    assert right(sparse_depths(views)) == 0 and right(sparse_depths(with_stereo(views))) > 0.15
