@@ -13,12 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, setting, threads
-from scenefuse.photos.photo_files import VIDEO_SUFFIXES, frame_name, geo_file, subtitles, thin_out, upright_size
+from scenefuse.photos.photo_files import (
+    VIDEO_SUFFIXES,
+    distinct_photos,
+    frame_name,
+    geo_file,
+    subtitles,
+    thin_out,
+    upright_size,
+)
 from scenefuse.photos.photos import (
     Photo,
     below_folder,
     bits_to_stretch,
-    distinct_photos,
     each_photo,
     inspect_photo,
     photo_notes,

@@ -14,7 +14,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scenefuse.core.stage import StageError
+from scenefuse.core.stage import StageError, sha256
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -133,6 +133,38 @@ def photo_files(folder: Path) -> list[Path]:
         raise StageError(f"the photo folder {folder} holds no photos; put JPEG, PNG, TIFF or BMP files there ({found})")
     beside = {folder / name for name in beside_photos(folder)}
     return sorted({*photos} - beside, key=lambda file: file.relative_to(folder).as_posix())
+
+
+def distinct_photos(folder: Path) -> tuple[list[str], list[str]]:
+    """Relative names of the photos below a folder (`photo_files`), sorted, of which none is another's file again, byte
+    for byte; and notes that name pictures that were left out.
+
+    A copy sees nothing that its original does not, but would count as one more photo that confirms it. The shortest
+    name stays.
+
+    Raises:
+        StageError: what `photo_files` says; a name that holds control characters or undecodable bytes.
+    """
+    names = [file.relative_to(folder).as_posix() for file in photo_files(folder)]
+    odd = next((name for name in names if not name.isprintable()), None)
+    if odd is not None:
+        raise StageError(f"{odd!r} in {folder} has a name that lists and tables cannot hold; rename it")
+    beside = beside_photos(folder)
+    of = "masks or other bands of photos by their names, or these photos in another format"
+    notes = [f"{len(beside)} pictures are {of}, and are left out ({beside[0]}, ...)"] if beside else []
+    by_size, first_of = dict[int, list[str]](), dict[str, str]()
+    for name in sorted(names, key=lambda name: (len(name), name)):
+        by_size.setdefault((folder / name).stat().st_size, []).append(name)
+    for alike in (group for group in by_size.values() if len(group) > 1):
+        kept = dict[str, str]()
+        for name in alike:
+            first = kept.setdefault(sha256(folder / name), name)
+            if first != name:
+                first_of[name] = first
+    if first_of:
+        one = f"{(copy := min(first_of))} of {first_of[copy]}"
+        notes.append(f"{len(first_of)} photos are copies of others, byte for byte, and are left out ({one})")
+    return [name for name in names if name not in first_of], notes
 
 
 def geo_file(folder: Path) -> Path | None:

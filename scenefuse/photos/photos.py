@@ -12,7 +12,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, quantity, read_json, sha256, threads, value, write_json
-from scenefuse.photos.photo_files import FORMATS, JPEG, beside_photos, in_folders, open_picture, photo_files
+from scenefuse.photos.photo_files import FORMATS, JPEG, in_folders, open_picture
 from scenefuse.photos.pictures import JPEG_QUALITY, read_raw, stretched
 from scenefuse.photos.positions import exif_number, exif_text, stated_position
 
@@ -67,38 +67,6 @@ class Photo:
     def has_gps(self) -> bool:
         """Whether a position is known."""
         return self.latitude_deg is not None and self.longitude_deg is not None
-
-
-def distinct_photos(folder: Path) -> tuple[list[str], list[str]]:
-    """Relative names of the photos below a folder (`photo_files`), sorted, of which none is another's file again, byte
-    for byte; and notes that name pictures that were left out.
-
-    A copy sees nothing that its original does not, but would count as one more photo that confirms it. The shortest
-    name stays.
-
-    Raises:
-        StageError: what `photo_files` says; a name that holds control characters or undecodable bytes.
-    """
-    names = [file.relative_to(folder).as_posix() for file in photo_files(folder)]
-    odd = next((name for name in names if not name.isprintable()), None)
-    if odd is not None:
-        raise StageError(f"{odd!r} in {folder} has a name that lists and tables cannot hold; rename it")
-    beside = beside_photos(folder)
-    of = "masks or other bands of photos by their names, or these photos in another format"
-    notes = [f"{len(beside)} pictures are {of}, and are left out ({beside[0]}, ...)"] if beside else []
-    by_size, first_of = dict[int, list[str]](), dict[str, str]()
-    for name in sorted(names, key=lambda name: (len(name), name)):
-        by_size.setdefault((folder / name).stat().st_size, []).append(name)
-    for alike in (group for group in by_size.values() if len(group) > 1):
-        kept = dict[str, str]()
-        for name in alike:
-            first = kept.setdefault(sha256(folder / name), name)
-            if first != name:
-                first_of[name] = first
-    if first_of:
-        one = f"{(copy := min(first_of))} of {first_of[copy]}"
-        notes.append(f"{len(first_of)} photos are copies of others, byte for byte, and are left out ({one})")
-    return [name for name in names if name not in first_of], notes
 
 
 def orientations_in(content: Mapping[str, Any]) -> dict[str, int]:

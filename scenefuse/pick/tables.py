@@ -9,8 +9,7 @@ from scenefuse.core.project import Project
 from scenefuse.core.stage import StageError, read_json
 from scenefuse.crop.marked import MIN_INSIDE
 from scenefuse.marks.clicks import Kind
-from scenefuse.photos.photo_files import frame_name, thin_out, upright_size
-from scenefuse.photos.photos import distinct_photos
+from scenefuse.photos.photo_files import distinct_photos, frame_name, thin_out, upright_size
 from scenefuse.pick.document import (
     Corners,
     Document,

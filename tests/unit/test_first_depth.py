@@ -72,7 +72,7 @@ def test_the_stage_writes_maps_near_the_truth_and_says_how_many_are_confirmed(tm
 
 def test_too_few_points_or_photos_is_one_sentence():
     views, _ = plane_views()
-    with pytest.raises(StageError, match="SfM points lie on the object"):
+    with pytest.raises(StageError, match="only 3 points lie on the object"):
         points_on_object(replace(views, tracks=[np.arange(3)] * 8), 4)
     with pytest.raises(StageError, match="needs at least 3"):
         points_on_object(replace(views, held_out=np.arange(8) > 1), 4)

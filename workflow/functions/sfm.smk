@@ -1,5 +1,5 @@
 # Inputs of structure from motion: the photos that the tables name.
-from scenefuse.photos.photo_files import frame_name, thin_out
+from scenefuse.photos.photo_files import distinct_photos, frame_name, thin_out
 
 
 def photos_of(row, who):
@@ -88,7 +88,6 @@ def check_survey(scene):
     own = {column: Path(f) for column, f in files.items() if not made_here(f)}
     if own and Path(row["photos"]).is_dir() and not made_here(row["photos"]):
         # Takes long to import, and most scenes have no survey.
-        from scenefuse.photos.photos import distinct_photos
         from scenefuse.georef.control import check_survey_files
 
         try:
@@ -173,8 +172,6 @@ def names_in(folder, where):
     """The photos in a cell's folder, by name; None where it is no folder, or a rule makes it."""
     if not folder or made_here(folder) or not Path(folder).is_dir():
         return None
-    from scenefuse.photos.photos import distinct_photos
-
     try:
         return {name: Path(folder, name) for name in distinct_photos(Path(folder))[0]}
     except StageError as error:
@@ -211,7 +208,6 @@ def check_lengths(name):
     photos = object_row(name)["photos"]
     for file in own_file("object", name, "lengths"):
         if Path(photos).is_dir() and not made_here(file):
-            from scenefuse.photos.photos import distinct_photos
             from scenefuse.georef.control import check_survey_files
 
             try:
