@@ -101,6 +101,7 @@ class Registration:
         scales: the scale prior.
         agreement: fitness, RMSE and normals at the best pose; see `registration_metrics`.
         unit: of the scene's lengths.
+        sides_estimated: whether the object's normals are inwards, and their sides were estimated.
     """
 
     outcome: Outcome | None
@@ -108,6 +109,7 @@ class Registration:
     scales: ScaleRange
     agreement: dict[str, dict[str, Any]]
     unit: str = "scene units"
+    sides_estimated: bool = False
 
     @property
     def registered(self) -> bool:
@@ -242,12 +244,12 @@ def find_in_scene(
         found = _unless_elsewhere(found, [other for other, _ in tried], obj, settings.fine)
     inward = None if obj.normals is None else ((obj.points - obj.points.mean(0)) * obj.normals).sum(1) < 0
     if not found.registered and inward is not None and inward.mean() > 0.5:
-        other = find_in_scene(
+        other, where, places = find_in_scene(
             replace(obj, normals=None), scene, settings, seed,
             ups=ups, up_in_scene=up_in_scene, scales=scales, unit=unit, marked=marked,
         )  # fmt: skip
-        if other[0].registered:
-            return other
+        if other.registered:
+            return replace(other, sides_estimated=True), where, places
     ranked = sorted((one for one in tried if one[1] is not scene), key=lambda one: -one[0].total)
     places = [(one.total, np.stack([there.points.min(0), there.points.max(0)])) for one, there in ranked]
     return with_agreement(found, obj, part, settings, seed), part, places

@@ -125,6 +125,9 @@ def register(
         given.object, whole, settings, seed,
         ups=given.ups, up_in_scene=known.ups()[1], scales=scales, unit=unit, marked=marked,
     )  # fmt: skip
+    if found.sides_estimated:
+        notes.append(f"most normals of {object} face inwards: it is found with their sides estimated from the points")
+        print(f"note       {notes[-1]}", flush=True)
     if not marked:
         searched = f"{given.searched}, and the parts of it that look like the object"
         given = replace(given, scene=replace(given.scene, part=part), searched=searched)

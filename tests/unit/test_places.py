@@ -99,7 +99,8 @@ def test_an_object_turned_inside_out_is_searched_again_without_the_sides_of_its_
     monkeypatch.setattr(register, "with_agreement", lambda found, *known: found)
     for side, found in ((-1, True), (1, False)):
         obj = replace(yard.object, normals=side * yard.object.normals)
-        assert find_in_scene(obj, yard.scene, LITTLE, 0, marked=True)[0].registered == found
+        registration = find_in_scene(obj, yard.scene, LITTLE, 0, marked=True)[0]
+        assert registration.registered == registration.sides_estimated == found
 
 
 def test_an_object_that_fits_nowhere_may_not_be_there(monkeypatch, yard):
