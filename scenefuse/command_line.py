@@ -113,6 +113,7 @@ def _export() -> None:
     parser.add_argument("--object", nargs="+", dest="names", metavar="NAME", help="default: all that are finished")
     facade = "three points of a facade of one object, to draw it as well"
     parser.add_argument("--facade", nargs=9, type=float, metavar=("X", "Y", "Z") * 3, help=facade)
+    parser.add_argument("--zip", type=Path, metavar="FILE", help="and all of it with the report in one file to send")
     words, others = parser.parse_known_args(sys.argv[1:])
     finished = sorted(path.parent.name for path in Path().glob("results/objects/*/fused.ply"))
     missing = [name for name in words.names or () if name not in finished]
@@ -120,6 +121,8 @@ def _export() -> None:
         which = f"results/objects/{missing[0]}/fused.ply is not" if missing else "no results/objects/NAME/fused.ply is"
         sys.exit(f"error: {which} here ({Path.cwd()}); run the workflow first (scenefuse run)")
     names = sorted(words.names or finished)
+    if words.zip and not REPORT.is_file():
+        sys.exit(f"error: --zip needs {REPORT}, which is not here; run the workflow to its end first (scenefuse run)")
     if words.facade:
         if len(names) > 1:
             sys.exit("error: --facade is of one object; name it by --object")
@@ -146,6 +149,14 @@ def _export() -> None:
         ended = subprocess.run(page).returncode
         if not ended and REPORT.stat().st_mtime == shown:
             print(closing_lines(REPORT.parent), flush=True)
+    if words.zip and not ended:
+        from scenefuse.report.pack import write_zip
+
+        try:
+            write_zip(REPORT, map(Path, targets), words.zip)
+        except OSError as error:
+            sys.exit(f"error: {error}")
+        print(f"To send: {words.zip} ({words.zip.stat().st_size / 1e6:.0f} MB); unpacked, open its {REPORT.name}")
     sys.exit(ended)
 
 

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -566,6 +567,36 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
     with pytest.raises(SystemExit):
         command_line.main()
     assert capsys.readouterr().out == exported
+
+
+def test_a_zip_holds_the_page_and_what_it_links_to_so_that_links_work_where_it_is_unpacked(
+    tmp_path: Path, monkeypatch, capsys
+):
+    results = tmp_path / "results"
+    for name in ("objects/shed/fused.ply", "objects/shed/drawings/plan.png", "scenes/yard/dense.ply", "secret.txt"):
+        (results / name).parent.mkdir(parents=True, exist_ok=True)
+        (results / name).write_text(name)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(subprocess, "run", lambda words, **_: subprocess.CompletedProcess(words, 0))
+    monkeypatch.setattr(facts, "closing_lines", str)
+    words = ["scenefuse", "export", "--zip", "to/send.zip"]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit, match="--zip needs results/summary/report.html, which is not here"):
+        command_line.main()
+    links = '<a href="../objects/shed/fused.ply">a</a><a href="../gone.ply">b</a><a href="#shed">c</a>'
+    (results / "summary").mkdir()
+    (results / "summary/report.html").write_text(links, encoding="utf-8")
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    assert ended.value.code == 0 and "To send: to/send.zip (0 MB)" in capsys.readouterr().out
+    with zipfile.ZipFile("to/send.zip") as archive:
+        files = {"report.html", "objects/shed/fused.ply", "objects/shed/drawings/plan.png"}
+        assert set(archive.namelist()) == files
+        assert 'href="objects/shed/fused.ply"' in archive.read("report.html").decode()
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "export", "--zip", "to"])
+    with pytest.raises(SystemExit, match="error: .*to"):
+        command_line.main()
 
 
 def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_interpolated(closed, tmp_path: Path):
