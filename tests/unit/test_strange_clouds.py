@@ -3,6 +3,7 @@ right."""
 
 import io
 import json
+import re
 import struct
 from base64 import b64encode
 from pathlib import Path
@@ -532,6 +533,37 @@ def test_a_mesh_in_ply_has_the_colours_of_its_textures_or_faces(tmp_path, text, 
     PlyData(elements, text, comments=["TextureFile t 1.png"]).write(tmp_path / "a.ply")
     left, right, normal, _ = sides(tmp_path / "a.ply")
     assert (left, right) == pytest.approx((0.25, 0.75), abs=0.01) and normal == pytest.approx([0, 0, 1])
+
+
+@pytest.mark.parametrize("form", ["obj", "ply", "glb"])
+def test_a_texture_is_not_hidden_by_vertices_that_are_white(tmp_path, form):
+    halves(tmp_path / "t.png")
+    path = tmp_path / f"a.{form}"
+    if form == "obj":
+        (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd t.png\n")
+        white = re.sub("(v [^v]*)\n", r"\1 1 1 1\n", SQUARE)
+        path.write_text(f"mtllib a.mtl\n{white}usemtl m\nf 1/1 2/2 3/3 4/4\n")
+    elif form == "ply":
+        rows = "".join(f"{x:g} {y:g} 0 {x:g} {y:g} 255 255 255\n" for x, y, _ in CORNERS)
+        more = "property float s\nproperty float t\n"
+        more += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+        faces = "element face 1\nproperty list uchar int vertex_indices\ncomment TextureFile t.png\nend_header\n"
+        path.write_text(HEAD.format(4) + more + faces + rows + "4 0 1 2 3\n")
+    else:
+
+        def change(document):
+            white = np.full((4, 3), 1, "<f4").tobytes()
+            document["buffers"] = [
+                {"byteLength": 0},
+                {"byteLength": 48, "uri": f"data:;base64,{b64encode(white).decode()}"},
+            ]
+            document["bufferViews"].append({"buffer": 1, "byteLength": 48})
+            accessor = {"bufferView": len(document["bufferViews"]) - 1, "componentType": 5126, "count": 4}
+            document["accessors"].append(accessor | {"type": "VEC3"})
+            document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = len(document["accessors"]) - 1
+
+        glb(path, change)
+    assert sides(path)[:2] == pytest.approx([0.25, 0.75], abs=0.01)
 
 
 @pytest.mark.parametrize("faces", [True, False])

@@ -105,17 +105,21 @@ def sampled_columns(mesh: Mesh) -> Columns:
 
 
 def _colors(mesh: Mesh, face: NDArray[np.int64], weights: Array) -> Array | None:
-    """(N, 3) colours at points of faces (N,) with barycentric weights (N, 3): of the vertices, else the materials."""
-    if mesh.colors is not None:
-        return np.asarray(np.einsum("nk,nkc->nc", weights, mesh.colors[mesh.faces[face]]))
-    if all(material.picture is None and material.color == Material.color for material in mesh.materials):
+    """(N, 3) colours at points of faces (N,) with barycentric weights (N, 3): of a picture, else the vertices, else the
+    material. Beside materials, programs write white for vertices that have none."""
+    plain = all(material.picture is None and material.color == Material.color for material in mesh.materials)
+    own = None if mesh.colors is None or (mesh.colors.min() == 255 and not plain) else mesh.colors
+    if own is None and plain:
         if mesh.materials:
             print("note: the mesh's materials have neither pictures nor colours: it has none", flush=True)
         return None
     colors, of = np.full((len(face), 3), 255.0), mesh.material[face]
+    if own is not None:
+        colors = np.einsum("nk,nkc->nc", weights, own[mesh.faces[face]])
     for number, material in enumerate(mesh.materials):
         rows = np.flatnonzero(of == number)
-        colors[rows] = material.color
+        if own is None:
+            colors[rows] = material.color
         if material.picture is None or mesh.uvs is None:
             continue
         uv = np.einsum("nk,nkc->nc", weights[rows], mesh.uvs[face[rows]])

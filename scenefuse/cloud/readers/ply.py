@@ -86,7 +86,7 @@ def in_rows(path: Path) -> bool:
 
 def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
     """Points, so many rows at a time; where there are faces, points drawn from them, all at once, with the colours of
-    vertices, else of faces, else of a texture.
+    a texture, else of vertices, else of faces.
 
     Raises:
         StageError: the file is cut short, or a row of text is of another length.
