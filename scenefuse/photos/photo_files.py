@@ -51,7 +51,7 @@ COORDS = "odm_georeferencing/coords.txt"
 # What the name of a mask may have more than its photo's: a_mask, a.jpg.mask, a-mask, mask_a.
 MASK = re.compile(r"(.+?)(?:[_. -]mask)+|mask[_. -](.+)", re.DOTALL)
 # What drones take along with a photo of the same number: thermal and multispectral bands.
-BAND = re.compile(r".*?(\d{4,})_(?:(t|ms_\w+|gre|nir|red|reg)|[vwzd]|rgb)", re.DOTALL)
+BAND = re.compile(r".*?(\d{4,})_(?:(t|thrm|ms_\w+|gre|nir|red|reg)|[vwzd]|wide|zoom|rgb)", re.DOTALL)
 # What to do about names that do not tell photos apart.
 RENAME = "give the folder that holds the photos alone, or every photo a name of its own"
 

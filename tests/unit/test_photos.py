@@ -209,6 +209,7 @@ def test_photos_of_all_modes_are_turned_and_made_smaller(tmp_path, name, mode, k
     [
         ("DJI_20240501120000_0001_V", ["DJI_20240501120001_0001_T"]),
         ("DJI_0001_W", ["thermal/DJI_0001_T"]),
+        ("DJI_20200724102724_0001_ZOOM", ["DJI_20200724102723_0001_THRM"]),
         ("DJI_0001_D", ["DJI_0001_MS_G", "DJI_0001_MS_NIR"]),
         ("IMG_170101_0001_RGB", ["IMG_170101_0001_GRE", "IMG_170101_0001_REG"]),
     ],
