@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from scenefuse.cloud.crs import plane
-from scenefuse.core.stage import StageError, atomic_directory, read_json, value, write_json
+from scenefuse.cloud.crs import has_place, plane, unit_m
+from scenefuse.core.stage import StageError, atomic_directory, read_json, write_json
 from scenefuse.core.transforms import Array
+from scenefuse.photos.geodesy import GridFrame, LocalFrame, scene_frame
 from scenefuse.photos.workspace import View, write_model
-from scenefuse.surface.gltf import earth_from_scene
 from scenefuse.surface.make_surface import SurfaceInputs, placed_views
 
 # Cameras of OpenGL and nerfstudio look along -z, with y up.
@@ -57,13 +57,11 @@ def export_cameras(
     with atomic_directory(folder) as output:
         write_model(output, views)
         write_json(output / "transforms.json", {"camera_model": "PINHOLE", "frames": frames})
-        known = {} if georeference_json is None else read_json(georeference_json)
-        crs = value(known, "crs") if "crs" in known else None
-        document = _metashape(views, earth_from_scene(georeference_json), crs)
-        ET.ElementTree(document).write(output / "cameras.xml", encoding="utf-8", xml_declaration=True)
+        frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
+        ET.ElementTree(_metashape(views, frame)).write(output / "cameras.xml", encoding="utf-8", xml_declaration=True)
 
 
-def _metashape(views: list[View], earth_from_scene: Array | None, crs: str | None) -> ET.Element:
+def _metashape(views: list[View], frame: LocalFrame | GridFrame | None) -> ET.Element:
     """What Metashape's "Import Cameras" reads: a sensor a camera, poses in the scene's frame, and that on the Earth."""
     document = ET.Element("document", version="2.0.0")
     chunk = ET.SubElement(document, "chunk", label="scenefuse", enabled="true")
@@ -81,15 +79,34 @@ def _metashape(views: list[View], earth_from_scene: Array | None, crs: str | Non
             ET.SubElement(calibration, name).text = repr(float(number_px))
         camera = ET.SubElement(cameras, "camera", id=key, sensor_id=key, label=label, enabled="true")
         ET.SubElement(camera, "transform").text = _numbers(view.world_from_cam)
-    if earth_from_scene is not None and crs is not None:
-        scale = float(np.cbrt(np.linalg.det(earth_from_scene[:3, :3])))
+    if frame is not None and frame.crs is not None and has_place(frame.crs):
+        crs = pyproj.CRS.from_user_input(frame.crs)
+        earth = _earth_from_scene(frame, crs)
+        scale = float(np.cbrt(np.linalg.det(earth[:3, :3])))
         transform = ET.SubElement(chunk, "transform")
-        ET.SubElement(transform, "rotation").text = _numbers(earth_from_scene[:3, :3] / scale)
-        ET.SubElement(transform, "translation").text = _numbers(earth_from_scene[:3, 3])
+        ET.SubElement(transform, "rotation").text = _numbers(earth[:3, :3] / scale)
+        ET.SubElement(transform, "translation").text = _numbers(earth[:3, 3])
         ET.SubElement(transform, "scale").text = repr(scale)
         # Its heights lie above the ellipsoid: those of a geoid would be computed once more.
-        ET.SubElement(chunk, "reference").text = plane(pyproj.CRS.from_user_input(crs)).to_wkt("WKT1_GDAL")
+        ET.SubElement(chunk, "reference").text = plane(crs).to_wkt("WKT1_GDAL")
     return document
+
+
+def _earth_from_scene(frame: LocalFrame | GridFrame, crs: pyproj.CRS) -> Array:
+    """(4, 4) from a scene's frame in a CRS to Earth-centred coordinates (m) on that CRS's own datum, which Metashape
+    takes them to be on; right at the scene's origin."""
+    grid = plane(crs).source_crs if plane(crs).is_bound else plane(crs)
+    assert grid is not None and grid.geodetic_crs is not None
+    axes = pyproj.CRS.from_epsg(4978).to_json_dict()["coordinate_system"]
+    datum = grid.geodetic_crs.to_json_dict() | {"type": "GeodeticCRS", "coordinate_system": axes}
+    datum.pop("id", None)
+    to_earth = pyproj.Transformer.from_crs(grid.to_3d(), pyproj.CRS.from_json_dict(datum), always_xy=True)
+    step = 100.0
+    corners = frame.in_crs(step * np.vstack([np.zeros(3), np.eye(3)])) * [1, 1, unit_m(crs)]
+    origin, *ends = np.column_stack(to_earth.transform(*corners.T))
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = (np.array(ends) - origin).T / step, origin
+    return matrix
 
 
 def _numbers(values: Array) -> str:

@@ -458,12 +458,14 @@ def test_cameras_of_both_sides_are_exported_in_the_frame_of_the_scene(tmp_path: 
     assert matrix[2, 2] > 0.99
 
 
-@pytest.mark.parametrize("crs", ["EPSG:25832", "EPSG:25832+7837"])
-def test_metashape_reads_the_cameras_and_their_place(tmp_path: Path, crs):
+@pytest.mark.parametrize(("crs", "easting"), [("EPSG:25832", 5e5), ("EPSG:25832+7837", 5e5), ("EPSG:31467", 3.5e6)])
+def test_metashape_reads_the_cameras_and_their_place(tmp_path: Path, crs, easting):
     workspace, folder = tmp_path / "scenes/yard/undistorted", tmp_path / "scenes/yard/cameras"
     (workspace / "sparse").mkdir(parents=True)
     write_model(workspace / "sparse", from_above(3))
-    write_json(tmp_path / "g.json", GEOREFERENCE | {"crs": quantity(crs, "")})
+    origin = [easting + 100, 5200200.0, 300.0]
+    place = {"crs": quantity(crs, ""), "origin_in_crs": quantity(origin, "m"), "length_unit": quantity("m", "")}
+    write_json(tmp_path / "g.json", place)
     export_cameras(scene_workspace=workspace, objects=[], georeference_json=tmp_path / "g.json", folder=folder)
     found = {given.name: given for given in read_metashape(folder / "cameras.xml")[0]}
     for view in from_above(3):
@@ -471,11 +473,9 @@ def test_metashape_reads_the_cameras_and_their_place(tmp_path: Path, crs):
         lens = found[Path(view.name).stem].camera
         assert np.allclose(lens.calibration_matrix(), view.intrinsics)
     place = metashape_place(folder / "cameras.xml")
-    assert place is not None and place.crs.to_epsg() == 25832
-    easting, northing, height = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:25832").transform(
-        *place.earth_from_model.translation
-    )
-    assert (easting, northing, height) == pytest.approx((500100, 5200200, 300), abs=0.01)
+    # Its numbers are on the datum of its CRS, which of DHDN lies 700 m from WGS84.
+    assert place is not None and place.crs.to_epsg(20) == int(crs[5:10])
+    assert place.in_crs(np.zeros((1, 3)))[0] == pytest.approx(origin, abs=0.01)
 
 
 def test_tiles_hold_every_point_once_and_lie_where_the_scene_lies(closed, tmp_path: Path, monkeypatch):
