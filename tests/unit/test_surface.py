@@ -474,7 +474,7 @@ def test_metashape_reads_the_cameras_and_their_place(tmp_path: Path, crs, eastin
         assert np.allclose(lens.calibration_matrix(), view.intrinsics)
     place = metashape_place(folder / "cameras.xml")
     # Its numbers are on the datum of its CRS, which of DHDN lies 700 m from WGS84.
-    assert place is not None and place.crs.to_epsg(20) == int(crs[5:10])
+    assert place is not None and crs_name(crs[:10]).split(" (")[0] in place.crs.name
     assert place.in_crs(np.zeros((1, 3)))[0] == pytest.approx(origin, abs=0.01)
 
 
