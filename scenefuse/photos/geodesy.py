@@ -176,7 +176,8 @@ def frame_notes(georeference: Path | None) -> list[str]:
         place = "{:.12g} {:.12g} {:.12g}".format(*known["origin_in_crs"])
         notes[0] += f" {place} in {crs_name(crs) if crs else 'the coordinates of the given cloud'}"
     if crs and "origin_latitude_deg" in known:
-        notes += [f"heights: {heights_of(crs, known.get('control_points'), known.get('origin_altitude_m'))}"]
+        heights = heights_of(crs, known.get("control_points"), known.get("origin_altitude_m"), given_place(known))
+        notes += [f"heights: {heights}"]
     return [" ".join(note.encode("ascii", "replace").decode().split()) for note in notes]
 
 
@@ -186,18 +187,28 @@ def compass(heading_deg: float) -> str:
     return names[round(heading_deg / 45) % len(names)]
 
 
-def heights_of(crs: str | None, control_points: int | None, altitude_m: float | None) -> str:
+def given_place(known: Mapping[str, Any]) -> str:
+    """What a user gave that says where the photos lie: the cloud on which they were laid, or cameras; "" for neither.
+
+    Args:
+        known: values of georeference.json, or the cells that scenes.tsv has of them.
+    """
+    return "cloud" if "met_share" in known else "cameras" if known.get("up_cue") == "given cameras" else ""
+
+
+def heights_of(crs: str | None, control_points: int | None, altitude_m: float | None, given: str = "") -> str:
     """From where heights of a scene with photos are counted.
 
     Args:
         crs: of the scene.
         control_points: how many place it.
         altitude_m: of its origin; None where no position has a height.
+        given: what `given_place` says.
     """
     if altitude_m is None:
         return "relative to the middle camera: no position has a height"
     if crs is not None and (whole := pyproj.CRS.from_user_input(crs)).is_compound:
         return whole.sub_crs_list[1].name
-    if control_points:
-        return "those of the control points"
+    if given or control_points:
+        return f"those of the {f'given {given}' if given else 'control points'}"
     return "as the photos' GPS gives them, which does not say whether above the ellipsoid or the sea"

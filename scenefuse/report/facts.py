@@ -17,7 +17,7 @@ from PIL.ExifTags import IFD, Base
 from scenefuse.cloud.crs import crs_name
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.version import VERSION
-from scenefuse.photos.geodesy import heights_of
+from scenefuse.photos.geodesy import given_place, heights_of
 from scenefuse.photos.photo_files import open_picture
 from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.report.run_summary import ALONE, ObjectSummary
@@ -113,12 +113,12 @@ def _scale(has: dict[str, Any]) -> str:
         return f"trust it as far as the {has['control_points']:.0f} control points that give it (see Position)"
     if "gps_scale_sd_log" in has:
         return f"{_trust(has['gps_scale_sd_log'], has['length_unit'])}, by the photos' GPS"
-    if has.get("lengths", 0) > 1:
-        return (
-            f"trust it to {percent(has['length_rms_pct'] / 100)}, by which {has['lengths']:.0f} known lengths disagree"
-        )
-    given = "one known length" if "lengths" in has else "the given cloud"
-    return f"it is that of {given}; nothing checks it"
+    given, count = given_place(has), has.get("lengths", 0)
+    if count > (not given):
+        disagree = f"{count:.0f} known lengths disagree" if count > 1 else "one known length disagrees"
+        return f"trust it to {percent(has['length_rms_pct'] / 100)}, by which {disagree}"
+    source = "one known length" if count else f"the given {given or 'cloud'}"
+    return f"it is that of {source}; nothing checks it"
 
 
 def is_current(made: Path, source: Path) -> bool:
@@ -204,7 +204,8 @@ def scene_facts(row: Row) -> dict[str, str]:
         north, east = has["latitude_deg"], has["longitude_deg"]
         place = f"{abs(north):.5f}° {'NS'[north < 0]}, {abs(east):.5f}° {'EW'[east < 0]}"
         above = f", {has['altitude_m']:,.1f} m" if "altitude_m" in has else ""
-        facts["Heights"] = heights_of(has.get("crs"), has.get("control_points"), has.get("altitude_m"))
+        given = given_place(has)
+        facts["Heights"] = heights_of(has.get("crs"), has.get("control_points"), has.get("altitude_m"), given)
         facts["Local frame"] = f"metres east, north and up from {place}{above}"
     if found := accuracies(row):
         facts["Position"] = f"absolute, where on Earth the scene lies: {found[0]}"

@@ -165,8 +165,9 @@ def scenes_table(scenes: list[SceneSummary], inputs: RunInputs) -> pd.DataFrame:
 
 
 def _scale_sd(scene: Fields) -> float | None:
-    """How well the photos' GPS gives a scene's scale; None where nothing or control points give it."""
-    return None if "georeference.control_points" in scene else find(scene, "georeference.gps_scale_sd_log")
+    """How well the photos' GPS gives a scene's scale; None where nothing, control points or a given cloud give it."""
+    others = {"georeference.control_points", "georeference.met_share"}
+    return None if others & set(scene) else find(scene, "georeference.gps_scale_sd_log")
 
 
 def objects_table(run: RunSummary, inputs: RunInputs) -> pd.DataFrame:

@@ -547,12 +547,14 @@ def test_an_object_says_when_it_was_photographed_and_how_its_lengths_follow_from
     assert re.search(r"Scale +Trust it to 0\.5 %, 50\.0 mm on a 10 m wall \(standard deviation\)\n", text)
     assert re.search(r"Scale +Trust it to 0\.4 %, 40\.0 mm on a 10 m wall .*, by the photos' GPS\n", text)
     assert re.search(r"Made with scenefuse [\d.]+ on 20\d\d-\d\d-\d\d by Hof Müller", text)
-    # Where control points hold the scene, its GPS does not say how well its lengths are known.
-    write_json(scene / "georeference.json", here | {"control_points": quantity(5, "1")})
-    text = (summarise(results) / "summary.txt").read_text()
-    assert re.search(
-        r"Scale +Trust it to 0\.3 %, 30\.0 mm on a 10 m wall \(standard deviation\), beside the scene's\n", text
-    )
+    # Where control points or a cloud hold the scene, its GPS does not say how well its lengths are known.
+    for more in ({"control_points": quantity(5, "1")}, {"met_share": quantity(0.7, "1")}):
+        write_json(scene / "georeference.json", here | more)
+        text = (summarise(results) / "summary.txt").read_text()
+        assert re.search(
+            r"Scale +Trust it to 0\.3 %, 30\.0 mm on a 10 m wall \(standard deviation\), beside the scene's\n", text
+        )
+    assert re.search(r"Scale +It is that of the given cloud; nothing checks it\n", text)
     assert re.search(r"Made with scenefuse [\d.]+ on 20\d\d-\d\d-\d\d\.\n", text)
 
 
@@ -562,6 +564,11 @@ def test_an_object_says_when_it_was_photographed_and_how_its_lengths_follow_from
         ({}, "Do not trust it: nothing gives it, and lengths are in scene units"),
         ({"length_unit": "m"}, "It is that of the given cloud; nothing checks it"),
         ({"length_unit": "m", "lengths": 1}, "It is that of one known length; nothing checks it"),
+        ({"length_unit": "m", "up_cue": "given cameras"}, "It is that of the given cameras; nothing checks it"),
+        (
+            {"length_unit": "m", "met_share": 0.7, "lengths": 1, "length_rms_pct": 0.4},
+            "Trust it to 0.4 %, by which one known length disagrees",
+        ),
         ({"lengths": 3, "length_rms_pct": 0.4}, "Trust it to 0.4 %, by which 3 known lengths disagree"),
         ({"control_points": 5, "gps_scale_sd_log": 0.02}, "Trust it as far as the 5 control points that give it"),
         ({"gps_scale_sd_log": 0.02}, "Trust it to 2.0 %, 20.0 cm on a 10 m wall (standard deviation), by the photos'"),

@@ -239,6 +239,8 @@ def test_a_frame_is_described_in_a_line_or_two(tmp_path, known, notes):
     assert frame_notes(tmp_path / "known.json") == notes
     for more, heights in (
         ({"control_points": 4}, "heights: those of the control points"),
+        ({"met_share": 0.7}, "heights: those of the given cloud"),
+        ({"up_cue": "given cameras"}, "heights: those of the given cameras"),
         ({"crs": "EPSG:25832+7837"}, "heights: DHHN2016 height"),
         ({"origin_altitude_m": None}, "heights: relative to the middle camera: no position has a height"),
     ):
