@@ -68,7 +68,7 @@ def draw_scene(
     note += f"cameras (red): {len(views)}" if georeferenced else "given as a cloud"
     errors = pd.DataFrame() if residuals is None else read_table(residuals)
     known = {} if georeference_json is None else read_json(georeference_json)
-    place = length_unit(georeference_json), "crs" in known
+    place = length_unit(georeference_json), known.get("crs", {}).get("value") is not None
     save_png(figure, _scene_sheet(f"Scene {name}", note, cloud, views, boxes, errors, place))
 
 

@@ -181,6 +181,7 @@ def draw_surface(
     frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
     # Of the CRS in one of the scene, which counts in metres where its CRS may in feet.
     per_unit = 1.0 if frame is None else float(np.ptp(frame.in_crs(UP * np.arange(2)[:, None])[:, 2]))
+    has_north = frame is not None and frame.crs is not None
     with atomic_directory(folder) as output:
         pages = PdfPages(output / "drawings.pdf", metadata={"CreationDate": None})
         for side, axes in _axes_of(whole, turn, facade).items() if len(whole.faces) else ():
@@ -203,6 +204,7 @@ def draw_surface(
             drawing = draw(drawn, shown, axes, ratio * pixel_of(whole, painted))
             _write_bands(output / side, drawing, crs, shift)
             towards = f", looking towards {np.degrees(np.arctan2(-axes[2, 0], -axes[2, 1])) % 360:.0f}°"
+            towards += "" if has_north else ", y taken for north"
             scale = _scale(drawing, metres / ratio)
             where = {"above": "plan", "facade": "facade"}.get(side, f"elevation from the {side}")
             title = f"{name}, {where}{'' if side == 'above' else towards}"

@@ -367,6 +367,8 @@ def test_a_drawing_names_its_day_and_a_plan_its_crs_with_an_arrow_to_the_north(d
         assert re.search(r"drawn 20\d\d-\d\d-\d\d", plain) and (name in page) == (side == "above")
         assert (re.search(r"^N\b", page, re.MULTILINE) is not None) == (side == "above")
         assert not re.search(r"^N\b", plain, re.MULTILINE)
+        # Where no CRS says where it lies, its sides have their names by the axes.
+        assert ("y taken for north" in plain) == (side != "above") and "y taken for north" not in page
 
 
 def test_a_facade_is_drawn_of_the_plane_through_three_points_from_outside(coarse, placed):
@@ -641,7 +643,8 @@ def test_paper_begins_with_an_overview_and_gives_an_object_two_pages_with_its_si
     )
     assert "Hof Müller" in pages[0] and "Scene yard" in pages[0] and "ETRS89 / UTM zone 32N (EPSG:25832)" in pages[0]
     assert "completed" in pages[0] and "11.4 m × 10.0 m, 8.10 m high" in pages[0] and "11.4 m" in pages[1]
-    assert "from the north" in pages[2] and "1.00 scene units" in pages[2] and "1:" not in pages[2]
+    assert "from the north" in pages[2] and "y taken for north" in pages[2]
+    assert "1.00 scene units" in pages[2] and "1:" not in pages[2]
 
 
 def test_four_sides_on_paper_are_to_the_round_scale_that_is_written_below(placed, tmp_path: Path):
@@ -650,6 +653,7 @@ def test_four_sides_on_paper_are_to_the_round_scale_that_is_written_below(placed
     (tmp_path / "objects.tsv").write_text("object\tstatus\nshed\tregistered\n")
     write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")
     page = pypdfium2.PdfDocument(tmp_path / "r.pdf")[2]
+    assert "y taken for north" not in page.get_textpage().get_text_bounded()
     scale = int(re.search(r"1:(\d+) on A4", page.get_textpage().get_text_bounded())[1])
     known = read_json(tmp_path / "shed/drawings/drawings.json")
     with rasterio.open(tmp_path / "shed/drawings/south.tif") as file:

@@ -411,6 +411,18 @@ def test_scene_figure_with_a_failed_object(capture, tmp_path):
         draw_scene(name="demo", **files, objects=objects, figure=figure)
 
 
+def test_the_scene_s_sheet_has_an_arrow_to_the_north_in_a_crs_only(capture, tmp_path):
+    figure, about = tmp_path / "scene.png", tmp_path / "georeference.json"
+
+    def drawn(crs):
+        write_json(about, {"length_unit": quantity("m", ""), "crs": quantity(crs, "")})
+        draw_scene(name="demo", dense=capture / "dense.ply", georeference_json=about, objects=[], figure=figure)
+        return (cv2.imread(str(figure)) < 40).all(2).sum()
+
+    # A cloud whose file names no CRS has one that is null.
+    assert drawn("EPSG:25832") > drawn(None) + 20
+
+
 def test_the_scene_s_sheet_shows_the_errors_of_cameras_in_their_colour(capture, tmp_path):
     model = capture / "undistorted/sparse"
     names = [view.name for view in read_views(model)]
