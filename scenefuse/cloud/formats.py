@@ -5,8 +5,8 @@ Columns have the names that PLY uses (x, y, z, nx, ny, nz, red, green, blue); al
 the precision of the file. Libraries are loaded when a file needs them. A new format is a reader in READERS.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scenefuse.cloud.readers.columns import AT_ONCE, POSITION, Columns, named
 from scenefuse.cloud.readers.e57 import read_e57
 from scenefuse.cloud.readers.las import check_projected, las_crs, read_las
-from scenefuse.cloud.readers.meshes import read_gltf, read_obj
+from scenefuse.cloud.readers.meshes import named_by_gltf, named_by_obj, read_gltf, read_obj
 from scenefuse.cloud.readers.pcd import read_pcd
-from scenefuse.cloud.readers.ply import in_rows, read_ply
+from scenefuse.cloud.readers.ply import in_rows, named_by_ply, read_ply
 from scenefuse.cloud.readers.text import TEXTS, read_text
 from scenefuse.core.stage import StageError
 
@@ -36,6 +36,13 @@ READERS: dict[str, Callable[[Path, int], Iterator[Columns]]] = {
     ".e57": read_e57,
     ".pcd": read_pcd,
     **dict.fromkeys(TEXTS, read_text),
+}
+
+# Give the files that a mesh names.
+NAMED: dict[str, Callable[[Path], Iterable[Path]]] = {
+    ".obj": named_by_obj,
+    ".gltf": named_by_gltf,
+    ".ply": named_by_ply,
 }
 
 
@@ -76,6 +83,14 @@ def columns_in_parts(path: Path, degrees: bool = False) -> ColumnParts:
         held = list(parts())
         return lambda: iter(held)
     return parts
+
+
+def with_named(path: Path) -> list[Path]:
+    """A cloud's file and, of a mesh, what it names: materials, textures, buffers, whether these are there or not."""
+    found = [path]
+    with suppress(OSError, ValueError, LookupError, AttributeError):  # a damaged file, of which its reader tells
+        found += NAMED[path.suffix.lower()](path)
+    return found
 
 
 @contextmanager

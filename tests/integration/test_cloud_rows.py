@@ -10,6 +10,7 @@ import laspy
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 from support.cloud_files import UTM
 from support.planted import errors, plant
 from support.user_project import CLICKS, Project, planned
@@ -96,6 +97,29 @@ def test_only_a_change_of_a_cloud_reruns_its_import(project):
     os.utime(house, (1e9, 1e9))
     assert {"import_object_cloud", "register_object", "complete_scene"} <= rules
     assert not {"import_scene_cloud", "crop_scene"} & rules
+
+
+def test_a_texture_that_was_missing_or_is_another_reruns_the_import_of_its_mesh(tmp_path, snakemake):
+    corners = "v 0 0 0\nv 1 0 0\nv 1 1 1\nv 0 1 1\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    (tmp_path / "roof.obj").write_text(f"# roof\nmtllib roof.mtl\n{corners}usemtl m\nf 1/1 2/2 3/3 4/4\n")
+    (tmp_path / "roof.mtl").write_text("newmtl m\nmap_Kd -clamp on roof.png\n")
+    picture, target = tmp_path / "roof.png", "results/objects/roof/object.ply"
+    (tmp_path / "scenes.tsv").write_text("scene\tcloud\nyard\troof.obj\n")
+    (tmp_path / "objects.tsv").write_text("object\tscene\tcloud\nroof\tyard\troof.obj\n")
+    (tmp_path / "mine.yaml").write_text("scenes: scenes.tsv\nobjects: objects.tsv\n")
+
+    def run(*words):
+        done = snakemake(tmp_path, *words, target, config=tmp_path / "mine.yaml").stdout
+        return "Nothing to be done" in done, planned(done)
+
+    run()
+    assert run("-n")[0]
+    for color in (255, 128):
+        Image.new("RGB", (9, 9), (color, 0, 0)).save(picture)
+        os.utime(picture, (1e9, 1e9))
+        assert run("-n") == (False, {"import_object_cloud"})
+        run()
+        assert (read_cloud(tmp_path / target).colors == [color, 0, 0]).all() and run("-n")[0]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Meshes are read as points spread evenly over their faces, with the faces' normals and colours."""
 
 import json
+import os
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ from plyfile import PlyData, PlyElement
 from support.cloud_files import UTM
 
 from scenefuse.cloud.clouds import read_cloud
+from scenefuse.cloud.formats import with_named
 from scenefuse.cloud.readers.meshes import MESH_POINTS
 from scenefuse.core.stage import StageError
 
@@ -115,6 +117,23 @@ def test_an_obj_whose_texture_is_lost_has_its_materials_colour_and_that_is_said(
     (tmp_path / "roof.png").unlink()
     assert np.array_equal(np.unique(read_cloud(tmp_path / "roof.obj").colors, axis=0), [[128, 128, 128]])
     assert "roof.png cannot be read" in capsys.readouterr().out
+
+
+def test_what_a_mesh_names_is_known_whether_it_is_there_or_not(tmp_path):
+    write_obj(tmp_path / "roof.obj")
+    (tmp_path / "roof.png").unlink()
+    (tmp_path / "a.gltf").write_text(
+        '{"buffers": [{"uri": "my%20a.bin"}], "images": [{"uri": "data:,"}, {"uri": "a.PNG"}]}'
+    )
+    (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\ncomment TextureFile t 1.png\nend_header\n")
+    (tmp_path / "bad.gltf").write_text("{")
+    found = {name: [path.name for path in with_named(tmp_path / name)[1:]] for name in os.listdir(tmp_path)}
+    assert {name: named for name, named in found.items() if named} == {
+        "roof.obj": ["roof.mtl", "roof.png"],
+        "a.gltf": ["my a.bin", "a.PNG"],
+        "a.ply": ["t 1.png"],
+    }
+    assert with_named(tmp_path / "gone.obj") == [tmp_path / "gone.obj"]
 
 
 def test_an_obj_counts_vertices_from_the_end_where_it_says_so(tmp_path):

@@ -1,4 +1,5 @@
 # Clouds that the tables name in the place of photos.
+from scenefuse.cloud.formats import with_named
 
 
 def one_of(names):
@@ -11,8 +12,17 @@ def cloud_of(kind):
     return lambda wildcards: own_file(kind, wildcards[kind], "cloud")
 
 
+def cloud_files(kind):
+    """The same with the files that a mesh names, some of which may be missing: to know its state."""
+    return lambda wildcards: [
+        str(file)
+        for path in cloud_of(kind)(wildcards)
+        for file in with_named(Path(path))
+    ]
+
+
 def cloud_path(kind):
-    """The same, for a command line."""
+    """The cloud itself, for a command line."""
     return lambda wildcards: shlex.quote(*cloud_of(kind)(wildcards))
 
 

@@ -35,7 +35,7 @@ rule import_scene_cloud:
     params:
         source=cloud_path("scene"),
         crs=crs_flag,
-        files=state_of(cloud_of("scene")),
+        files=state_of(cloud_files("scene")),
         script=script("cloud/import_scene_cloud.py"),
         code=code("cloud/import_scene_cloud.py"),
     message:
@@ -65,7 +65,7 @@ rule import_object_cloud:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         source=cloud_path("object"),
-        files=state_of(cloud_of("object")),
+        files=state_of(cloud_files("object")),
         script=script("cloud/import_object_cloud.py"),
         code=code("cloud/import_object_cloud.py"),
     message:
@@ -101,7 +101,7 @@ rule import_posed_scene_cloud:
         source=cloud_path("scene"),
         place=options_of("sparse", "sparse_json", "georeference_json"),
         crs=lambda wildcards: crs_flag(wildcards) if lies_on_cloud(wildcards) else "",
-        files=state_of(cloud_of("scene")),
+        files=state_of(cloud_files("scene")),
         script=script("georef/import_posed_cloud.py"),
         code=code("georef/import_posed_cloud.py"),
     message:
@@ -135,7 +135,7 @@ use rule import_posed_scene_cloud as import_posed_object_cloud with:
         source=cloud_path("object"),
         place=options_of("sparse", "sparse_json", "workspace", "masks"),
         crs="",
-        files=state_of(cloud_of("object")),
+        files=state_of(cloud_files("object")),
         script=script("georef/import_posed_cloud.py"),
         code=code("georef/import_posed_cloud.py"),
     message:

@@ -10,7 +10,7 @@ import re
 from base64 import b64decode
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -268,11 +268,11 @@ def _row(cell: str, count: int) -> int:
 
 def _libraries(folder: Path, names: str) -> list[Path]:
     """The files of materials that a line names: one, perhaps with blanks, or several."""
-    whole = _beside(folder, names)
-    return [whole] if whole.is_file() else [_beside(folder, name) for name in names.split() or [names]]
+    whole = beside(folder, names)
+    return [whole] if whole.is_file() else [beside(folder, name) for name in names.split() or [names]]
 
 
-def _beside(folder: Path, name: str) -> Path:
+def beside(folder: Path, name: str) -> Path:
     """A file that another one names, there or, where the name is of another machine, by that beside it in any case."""
     parts = name.strip().strip('"').replace("\\", "/")
     path = folder / parts
@@ -280,6 +280,23 @@ def _beside(folder: Path, name: str) -> Path:
         return path
     last = Path(parts).name.lower()
     return next((other for other in sorted(folder.iterdir()) if other.name.lower() == last), path)
+
+
+def named_by_obj(path: Path) -> Iterator[Path]:
+    """The materials that an OBJ names before its first vertex, and their textures, whether they are there or not."""
+    for line in takewhile(lambda line: not line.startswith("v "), _obj_lines(path)):
+        for file in _libraries(path.parent, line[7:].strip()) if line.startswith("mtllib ") else []:
+            yield file
+            text = file.read_text(encoding="utf-8-sig", errors="replace") if file.is_file() else ""
+            for name in re.findall(r"(?im)^\s*map_kd\s+(.*)", text):
+                yield beside(file.parent, OPTIONS.sub("", name, count=1))
+
+
+def named_by_gltf(path: Path) -> Iterator[Path]:
+    """The buffers and pictures that a glTF of JSON names, whether they are there or not."""
+    document = json.loads(path.read_bytes())
+    uris = [part.get("uri", "data:") for kind in ("buffers", "images") for part in document.get(kind, [])]
+    yield from (beside(path.parent, unquote(uri)) for uri in uris if not uri.startswith("data:"))
 
 
 def _materials(path: Path) -> dict[str, Material]:
@@ -299,7 +316,7 @@ def _materials(path: Path) -> dict[str, Material]:
             found[name] = replace(found[name], color=color if len(color) == 3 else Material.color)
         elif word.lower() == "map_kd" and name:
             options = OPTIONS.match(rest)
-            picture = picture_beside(path.parent, rest[options.end() if options else 0 :])
+            picture = picture_of(beside(path.parent, rest[options.end() if options else 0 :]))
             found[name] = replace(found[name], picture=picture, place=_placed(options[0] if options else ""))
     return found
 
@@ -313,9 +330,8 @@ def _placed(options: str) -> Array:
     return place
 
 
-def picture_beside(folder: Path, name: str) -> NDArray[np.uint8] | None:
-    """The picture that a file in a folder names; None, and a note, where it cannot be read."""
-    file = _beside(folder, name)
+def picture_of(file: Path) -> NDArray[np.uint8] | None:
+    """The picture in a file; None, and a note, where it cannot be read."""
     return _picture(file.read_bytes() if file.is_file() else b"", str(file))
 
 
@@ -401,7 +417,7 @@ class _Gltf:
         """What an address in the document says, or names in its folder; nothing where that is not there."""
         if uri.startswith("data:"):
             return b64decode(uri.partition(",")[2])
-        file = _beside(self.folder, unquote(uri))
+        file = beside(self.folder, unquote(uri))
         return file.read_bytes() if file.is_file() else b""
 
     def parts(self, node: int, outer: Array) -> list[Mesh]:

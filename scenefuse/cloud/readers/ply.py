@@ -22,7 +22,16 @@ from scenefuse.cloud.readers.columns import (
     text_rows,
     typed,
 )
-from scenefuse.cloud.readers.meshes import Array, Material, Mesh, of_strip, picture_beside, sampled_columns, triangles
+from scenefuse.cloud.readers.meshes import (
+    Array,
+    Material,
+    Mesh,
+    beside,
+    of_strip,
+    picture_of,
+    sampled_columns,
+    triangles,
+)
 from scenefuse.core.stage import StageError
 
 KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -120,16 +129,15 @@ def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
         colors = np.repeat(np.array([face[name] for name in COLOR]).T, lengths, axis=0)
         points, rows = points[rows], np.arange(len(rows))
     painted = None if colors is None else bytes_of(colors).astype(np.float64)
-    textures = () if uvs is None else _textures(path)
+    textures = () if uvs is None else tuple(Material(picture_of(file)) for file in named_by_ply(path))
     numbers = np.array(face.get("texnumber", np.zeros(len(faces)))).astype(np.int64)[of]
     yield sampled_columns(Mesh(points, rows[places], painted, None if uvs is None else uvs[places], numbers, textures))
 
 
-def _textures(path: Path) -> tuple[Material, ...]:
-    """The textures that a header names, by which faces are numbered."""
+def named_by_ply(path: Path) -> list[Path]:
+    """The textures that a header names, by which faces are numbered, whether they are there or not."""
     with open(path, "rb") as file:
-        names = [line.removeprefix(TEXTURE) for line in _lines(file) if line.startswith(TEXTURE)]
-    return tuple(Material(picture_beside(path.parent, name)) for name in names)
+        return [beside(path.parent, line.removeprefix(TEXTURE)) for line in _lines(file) if line.startswith(TEXTURE)]
 
 
 def check_size(path: Path, elements: list[Element], offset: int, advice: str = "copy it again") -> None:
