@@ -4,7 +4,9 @@ what to do next.
 The words are made of a row of scenes.tsv or objects.tsv, for the report page and for summary.txt alike.
 """
 
+import contextlib
 import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from datetime import date
 from pathlib import Path
@@ -135,9 +137,10 @@ def surface_facts(folder: Path, row: Row) -> dict[str, str]:
         return {"Mesh": f"None: {value(found, 'reason')}"}
     place, has = f"results/objects/{folder.name}", _known(row)
     unit = _plural(has.get("unit", "m"))
-    mesh = f"{place}/surface.ply (local frame, {unit}), {place}/surface.glb (the same, metres, y up)"
+    of_glb = unit if unit == "scene units" else "metres"
+    mesh = f"{place}/surface.ply (local frame, {unit}), {place}/surface.glb (the same, {of_glb}, y up)"
     if bridged := value(found, "bridged_area"):
-        mesh += f"; {bridged:.2g} {found['bridged_area']['unit'].replace('2', '²')} of it {WORDS['bridged']}"
+        mesh += f"; {length(bridged, found['bridged_area']['unit'].replace('2', '²'))} of it {WORDS['bridged']}"
     if not is_current(folder / "drawings/drawings.pdf", folder / "surface.json"):
         return {"Mesh": mesh}
     above = f"; above.tif beside it is in {has['crs']}" if "crs" in has else ""
@@ -312,8 +315,9 @@ def photographed(photos_json: Path, folder: Path) -> str | None:
                 taken = exif.get_ifd(IFD.Exif).get(Base.DateTimeOriginal) or exif.get(Base.DateTime)
         except StageError:
             continue
-        if taken:
-            days.add(str(taken)[:10].replace(":", "-"))
+        # A camera whose clock was never set writes zeros or blanks.
+        with contextlib.suppress(ValueError):
+            days.add(str(date.fromisoformat(re.sub(r"\D", "-", str(taken)[:10]))))
     return " to ".join(dict.fromkeys([min(days), max(days)])) if days else None
 
 

@@ -532,11 +532,11 @@ def test_shares_of_a_whole_sum_to_100_as_they_are_written():
 def test_an_object_says_when_it_was_photographed_and_how_its_lengths_follow_from_the_scene_s(results):
     house, scene = results / "objects/house", results / "scenes/demo"
     (house / "frames").mkdir()
-    for name, date in (("a", "2024:06:03"), ("b", "2024:06:02")):
+    for name, date in (("a", "2024:06:03"), ("b", "2024:06:02"), ("c", "0000:00:00"), ("d", "    :  :  ")):
         exif = Image.Exif()
         exif[0x0132] = f"{date} 09:30:00"
         Image.new("RGB", (8, 6)).save(house / f"frames/{name}.jpg", exif=exif)
-    write_json(house / "photos.json", {"photos": [{"name": "a.jpg"}, {"name": "b.jpg"}]})
+    write_json(house / "photos.json", {"photos": [{"name": f"{name}.jpg"} for name in "abcd"]})
     write_json(house / "sparse.json", {"registered": quantity(39, "1"), "total": quantity(40, "1")})
     fine = json.loads((house / "registration/full/fine.json").read_text()) | {"scale_sd_log": quantity(0.003, "1")}
     write_json(house / "registration/full/fine.json", fine)
