@@ -60,15 +60,16 @@ def stated_position(gps: Mapping[int, Any], xmp: bytes) -> tuple[Position, str]:
     """
     latitude, longitude, altitude, below = (_first(pattern, xmp) for pattern in (LATITUDE, LONGITUDE, ALTITUDE, BELOW))
     by_exif = (gps.get(2), gps.get(1, ""), gps.get(4), gps.get(3, ""))
-    heights = (_altitude(gps.get(6), gps.get(5)), _altitude(altitude, below))
-    height = next((metres for metres in heights if metres is not None), None)
+    heights = [_altitude(gps.get(6), gps.get(5)), _altitude(altitude, below)]
     problems = []
     for north, north_of, east, east_of in (by_exif, (latitude, None, longitude, None)):
         if north is not None or east is not None:
             place, problem = degrees_of(north, north_of, east, east_of)
             if place is not None:
+                height = next((metres for metres in heights if metres is not None), None)
                 return Position(*place, height, *rtk_accuracy(xmp)), problem
             problems.append(problem)
+        heights.reverse()  # a height is best that of the position
     return Position(), problems[0] if problems else ""
 
 

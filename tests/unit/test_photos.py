@@ -365,7 +365,7 @@ XMP += b"<exif:GPSAltitude>125/10</exif:GPSAltitude><exif:GPSAltitudeRef>1</exif
 
 @pytest.mark.parametrize("xmp", [DJI, XMP])
 def test_where_exif_has_no_position_xmp_has(xmp):
-    for gps in ({}, {2: (NONE,), 4: (NONE,)}):
+    for gps in ({}, {2: (NONE,), 4: (NONE,)}, {2: (0.0,), 4: (0.0,), 6: R(0)}):
         position, note = stated_position(gps, xmp)
         assert (position.latitude_deg, position.longitude_deg, position.altitude_m) == (
             -33.5,
