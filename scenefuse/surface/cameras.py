@@ -10,7 +10,7 @@ import numpy as np
 import pyproj
 
 from scenefuse.cloud.crs import has_place, plane, unit_m
-from scenefuse.core.stage import StageError, atomic_directory, read_json, write_json
+from scenefuse.core.stage import atomic_directory, read_json, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.photos.geodesy import GridFrame, LocalFrame, scene_frame
 from scenefuse.photos.workspace import View, write_model
@@ -34,9 +34,6 @@ def export_cameras(
         objects: result folders of its objects.
         georeference_json: JSON of the scene, for its place in the world.
         folder: output.
-
-    Raises:
-        StageError: neither the scene nor an object in it has photos.
     """
     found = [] if scene_workspace is None else placed_views(SurfaceInputs(Path(), None, None, scene_workspace))
     for path in objects:
@@ -44,7 +41,7 @@ def export_cameras(
         if own.is_dir():
             found += placed_views(SurfaceInputs(path / "fused.ply", path / "fusion.json", own))
     if not found:
-        raise StageError("neither the scene nor an object in it has photos: there are no cameras to export")
+        print("no cameras: neither the scene nor an object with a place in it has photos", flush=True)
     root = folder.resolve().parents[2]
     frames, views = list[dict[str, Any]](), []
     for workspace, view in found:

@@ -458,6 +458,10 @@ def test_cameras_of_both_sides_are_exported_in_the_frame_of_the_scene(tmp_path: 
     assert np.allclose(matrix[:3, 3], pose.apply(centre))
     # OpenGL's cameras look along -z: down, here.
     assert matrix[2, 2] > 0.99
+    # A refused object in a cloud leaves none, which is no reason to end an export.
+    write_json(tmp_path / "objects/shed/fusion.json", {"scene_from_object": quantity(None, "m")})
+    export_cameras(objects=[tmp_path / "objects/shed"], folder=folder)
+    assert not read_views(folder) and not read_json(folder / "transforms.json")["frames"]
 
 
 @pytest.mark.parametrize(("crs", "easting"), [("EPSG:25832", 5e5), ("EPSG:25832+7837", 5e5), ("EPSG:31467", 3.5e6)])
