@@ -104,6 +104,8 @@ class FileSummary:
         """What a user should know of the file; of (N, 3) points as dense as its own, which are so far apart."""
         left_out = [f"{count} {why} of {self.path.name} were left out" for why, count in self.left_out.items() if count]
         more = [*precision_note(self.path, self.sample, step), *coincidence_note(self.path, points)]
+        if self.path.suffix.lower() in (".glb", ".gltf"):
+            more.append(f"{self.path.name} is turned so that z is up: what is x, y, z here is x, -z, y there")
         return [*left_out, *text_notes(self.path), *more]
 
 

@@ -9,6 +9,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 from support.cloud_files import UTM
 
+from scenefuse.cloud.cloud_file import CloudFile
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.cloud.formats import with_named
 from scenefuse.cloud.readers.meshes import MESH_POINTS
@@ -161,6 +162,8 @@ def test_a_glb_stands_upright_at_its_place(tmp_path):
     large, small = on_roof((cloud.points - [10, 0, 0]) / 2)
     assert (large | small).all() and large.any() and small.any()
     assert np.array_equal(np.unique(cloud.colors, axis=0), [[0, 255, 0]])
+    said = "roof.glb is turned so that z is up: what is x, y, z here is x, -z, y there"
+    assert CloudFile.of(tmp_path / "roof.glb").notes == [said]
 
 
 @pytest.mark.parametrize(
