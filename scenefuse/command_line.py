@@ -126,6 +126,13 @@ def _export() -> None:
     if words.facade:
         if len(names) > 1:
             sys.exit("error: --facade is of one object; name it by --object")
+        import numpy as np
+
+        from scenefuse.core.transforms import along_a_line
+
+        # Once they are kept, every export draws them.
+        if along_a_line(np.reshape(words.facade, (3, 3))):
+            sys.exit("error: the three points of --facade lie in a line; click three of its corners")
         Path(f"results/objects/{names[0]}/facade.txt").write_text(" ".join(map(str, words.facade)))
     scenes = sorted(path.parent.name for path in Path().glob("results/scenes/*/dense.ply"))
     # Given clouds have no cameras, and a scene that was not completed has no tiles.

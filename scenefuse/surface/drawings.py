@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.crs import crs_name
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, threads, write_json
-from scenefuse.core.transforms import UP, Array
+from scenefuse.core.transforms import UP, Array, along_a_line
 from scenefuse.fuse.compare import MARGIN
 from scenefuse.fuse.measure import SUPPORT
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
@@ -133,9 +133,9 @@ def facade_axes(surface: Surface, points: Array) -> Array:
     Raises:
         StageError: the points lie in a line.
     """
-    normal = np.cross(points[1] - points[0], points[2] - points[0])
-    if np.linalg.norm(normal) <= MARGIN * np.ptp(points, axis=0).max() ** 2:
+    if along_a_line(points):
         raise StageError("the three points of the facade lie in a line; click three of its corners")
+    normal = np.cross(points[1] - points[0], points[2] - points[0])
     toward, vertices = normal / np.linalg.norm(normal), surface.vertices
     beside = np.abs((vertices.points - points[0]) @ toward) <= MARGIN * vertices.diagonal
     assert vertices.normals is not None

@@ -558,14 +558,19 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
         command_line.main()
     assert [word for word in runs[2] if word.endswith("/tiles")] == ["results/scenes/yard/tiles"]
     (tmp_path / "results/scenes/yard/completed.ply").unlink()
-    facade = ["--facade", *["1", "-2", "3", "4", "5", "6", "7", "8", "9.5"]]
+    in_line = ["--facade", *"123456789"]
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "export", "--object", "shed", *in_line])
+    with pytest.raises(SystemExit, match="the three points of --facade lie in a line"):
+        command_line.main()
+    assert not Path("results/objects/shed/facade.txt").exists()
+    facade = ["--facade", *["1", "-2", "3", "4", "5", "6", "7", "8", "10.5"]]
     monkeypatch.setattr(sys, "argv", ["scenefuse", "export", *facade])
     with pytest.raises(SystemExit, match="name it by --object"):
         command_line.main()
     monkeypatch.setattr(sys, "argv", ["scenefuse", "export", "--object", "shed", *facade])
     with pytest.raises(SystemExit):
         command_line.main()
-    assert Path("results/objects/shed/facade.txt").read_text() == "1.0 -2.0 3.0 4.0 5.0 6.0 7.0 8.0 9.5"
+    assert Path("results/objects/shed/facade.txt").read_text() == "1.0 -2.0 3.0 4.0 5.0 6.0 7.0 8.0 10.5"
     capsys.readouterr()
     made, page = iter([(1, 1), (2, 2)]), "results/summary/report.html"
     monkeypatch.setattr(subprocess, "run", lambda words, **_: os.utime(page, next(made)) or done)
