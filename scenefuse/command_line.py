@@ -103,6 +103,10 @@ def _settings_files() -> tuple[list[Path], list[str]]:
 
 def _export() -> None:
     """make what is handed over of finished objects: surfaces, drawings, cameras, tiles, a PDF"""
+    from scenefuse.core.project import read_project
+    from scenefuse.core.settings import read_settings
+    from scenefuse.core.stage import StageError
+
     parser = argparse.ArgumentParser(
         prog="scenefuse export",
         description="Make surfaces, drawings, cameras, tiles and a PDF of finished objects, shown in the report."
@@ -115,8 +119,15 @@ def _export() -> None:
     parser.add_argument("--facade", nargs=9, type=float, metavar=("X", "Y", "Z") * 3, help=facade)
     parser.add_argument("--zip", type=Path, metavar="FILE", help="and all of it with the report in one file to send")
     words, others = parser.parse_known_args(sys.argv[1:])
-    finished = sorted(path.parent.name for path in Path().glob("results/objects/*/fused.ply"))
-    missing = [name for name in words.names or () if name not in finished]
+    try:
+        project = read_project(read_settings(*_settings_files()[0]))
+    except StageError as error:
+        sys.exit(f"error: {error}")
+    # Results of rows that were removed or renamed stay.
+    finished, missing = (
+        [name for name in names if Path(f"results/objects/{name}/fused.ply").is_file() == there]
+        for names, there in ((project.objects, True), (words.names or (), False))
+    )
     if missing or not finished:
         which = f"results/objects/{missing[0]}/fused.ply is not" if missing else "no results/objects/NAME/fused.ply is"
         sys.exit(f"error: {which} here ({Path.cwd()}); run the workflow first (scenefuse run)")
@@ -134,7 +145,7 @@ def _export() -> None:
         if along_a_line(np.reshape(words.facade, (3, 3))):
             sys.exit("error: the three points of --facade lie in a line; click three of its corners")
         Path(f"results/objects/{names[0]}/facade.txt").write_text(" ".join(map(str, words.facade)))
-    scenes = sorted(path.parent.name for path in Path().glob("results/scenes/*/dense.ply"))
+    scenes = sorted(name for name in project.scenes if Path(f"results/scenes/{name}/dense.ply").is_file())
     # Given clouds have no cameras, and a scene that was not completed has no tiles.
     needed = {"cameras": "results/*/*/undistorted", "tiles": "results/scenes/*/completed.ply", "pdf": str(REPORT)}
     what = [item for item in words.what if any(Path().glob(needed.get(item, "*")))]

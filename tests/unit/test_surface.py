@@ -528,11 +528,20 @@ def test_tiles_hold_every_point_once_and_lie_where_the_scene_lies(closed, tmp_pa
     assert len(counts) == 2 and 1000 < counts[0] < 10_000 and counts[1] >= len(closed.vertices)
 
 
+def write_tables(scenes: list[str], objects: list[str]) -> None:
+    """The tables of a project in this folder."""
+    Path("config").mkdir(exist_ok=True)
+    Path("config/scenes.tsv").write_text("scene\tcloud\n" + "".join(f"{name}\ta.ply\n" for name in scenes))
+    rows = "".join(f"{name}\t{scenes[0]}\tb.ply\n" for name in objects)
+    Path("config/objects.tsv").write_text(f"object\tscene\tcloud\n{rows}")
+
+
 def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["scenefuse", "export"])
     with pytest.raises(SystemExit, match=r"no results/objects/NAME/fused.ply is here \(.*\); run the workflow first"):
         command_line.main()
+    write_tables(["yard", "field"], ["shed", "barn"])
     for name in ("objects/shed/fused.ply", "objects/barn/fused.ply", "scenes/yard/dense.ply", "summary/report.html"):
         (tmp_path / "results" / name).parent.mkdir(parents=True)
         (tmp_path / "results" / name).touch()
@@ -557,6 +566,16 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
     with pytest.raises(SystemExit):
         command_line.main()
     assert [word for word in runs[2] if word.endswith("/tiles")] == ["results/scenes/yard/tiles"]
+    # Rows are removed from the tables, and their results stay.
+    write_tables(["field"], ["barn"])
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "export"])
+    with pytest.raises(SystemExit):
+        command_line.main()
+    made = {word for word in runs[4] if word.startswith("results/")}
+    assert made == {
+        f"results/{name}" for name in ("objects/barn/surface.glb", "objects/barn/drawings", "summary/report.pdf")
+    }
+    write_tables(["yard", "field"], ["shed", "barn"])
     (tmp_path / "results/scenes/yard/completed.ply").unlink()
     in_line = ["--facade", *"123456789"]
     monkeypatch.setattr(sys, "argv", ["scenefuse", "export", "--object", "shed", *in_line])
@@ -588,6 +607,7 @@ def test_a_zip_holds_the_page_and_what_it_links_to_so_that_links_work_where_it_i
         (results / name).parent.mkdir(parents=True, exist_ok=True)
         (results / name).write_text(name)
     monkeypatch.chdir(tmp_path)
+    write_tables(["yard"], ["shed"])
     monkeypatch.setattr(subprocess, "run", lambda words, **_: subprocess.CompletedProcess(words, 0))
     monkeypatch.setattr(facts, "closing_lines", str)
     words = ["scenefuse", "export", "--zip", "to/send.zip"]
