@@ -14,7 +14,7 @@ from scenefuse.cloud.formats import READERS, columns_in_parts
 from scenefuse.cloud.readers.text import TEXTS
 from scenefuse.core.settings import OWN_SETTINGS, PACKAGE, ROOT, schema_of
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.core.tables import Row, read_table
+from scenefuse.core.tables import Row, read_table, read_text
 from scenefuse.core.transforms import FIXING_POINTS
 from scenefuse.photos.photo_files import SUFFIXES, VIDEO_SUFFIXES, in_folders, photo_files
 
@@ -109,13 +109,13 @@ def project_rows(folder: Path, scene: Path | None, objects: Sequence[Path]) -> d
 
 
 def fill(table: Path, column: str, cells: Mapping[str, str]) -> None:
-    """Write the cells of a column of a table of objects, by their names; unknown ones get a row."""
-    rows = read_table(table, "object")
+    """Write the cells of a column of a table of objects, by their names; unknown ones get a row, comments stay."""
+    rows, comments = read_table(table, "object"), [x for x in read_text(table).splitlines() if x.startswith("#")]
     for name, cell in cells.items():
         rows.setdefault(name, {"object": name})[column] = cell
     columns = tuple(dict.fromkeys([*next(iter(rows.values())), column]))
     with atomic_file(table) as temporary:
-        temporary.write_text(_table(columns, rows.values()), encoding="utf-8")
+        temporary.write_text("\n".join([*comments, _table(columns, rows.values())]), encoding="utf-8")
 
 
 def default_name(path: Path) -> str:

@@ -94,6 +94,17 @@ def test_more_objects_are_added_by_a_command_that_names_the_others_too(two_folde
     assert [row["photos"] for row in rows.values()] == [str(two_folders / name) for name in ("close", "shed")]
 
 
+def test_a_user_s_comments_stay_in_a_table_that_gets_an_object(two_folders, workflow):
+    Project(two_folders).photos("shed")
+    workflow(SUMMARY)
+    run("close", prompts=(Path("clicks.tsv"),))
+    table = Path("flight_completed/config/objects.tsv")
+    table.write_text(f"{table.read_text()}# barn\tflight\tits roof is gone\n")
+    workflow("")
+    run("close", "shed", prompts=(Path("clicks.tsv"),) * 2)
+    assert "# barn\tflight\tits roof is gone\n" in table.read_text() and len(read_table(table, "object")) == 2
+
+
 def test_clicks_are_of_the_objects_with_photos_beside_one_that_is_a_cloud(two_folders, workflow):
     Path("wall.xyz").write_text("1 2 3\n4 5 6\n7 8 10\n")
     workflow(SUMMARY)
