@@ -5,7 +5,6 @@ import inspect
 import os
 import re
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -15,7 +14,6 @@ from scenefuse.core.version import VERSION
 
 ALL = "pip install 'scenefuse[all]'"
 SCENES = Path("config/scenes.tsv")
-REPORT = Path("results/summary/report.html")
 # Snakemake's options that say how much runs at a time, or that another machine decides it.
 PARALLEL = ("--cores", "-c", "--jobs", "-j", "--profile", "--workflow-profile", "--executor", "-e")
 
@@ -103,79 +101,9 @@ def _settings_files() -> tuple[list[Path], list[str]]:
 
 def _export() -> None:
     """make what is handed over of finished objects: surfaces, drawings, cameras, tiles, a PDF"""
-    from scenefuse.core.project import read_project
-    from scenefuse.core.settings import read_settings
-    from scenefuse.core.stage import StageError
+    from scenefuse.export import export
 
-    parser = argparse.ArgumentParser(
-        prog="scenefuse export",
-        description="Make surfaces, drawings, cameras, tiles and a PDF of finished objects, shown in the report."
-        " Nothing before them runs again.",
-        epilog="All other options are those of scenefuse run, as -n to see what would be made.",
-    )
-    parser.add_argument("--what", nargs="+", choices=EXPORTS, default=list(EXPORTS), help="default: all of them")
-    parser.add_argument("--object", nargs="+", dest="names", metavar="NAME", help="default: all that are finished")
-    facade = "three points of a facade of one object, to draw it as well"
-    parser.add_argument("--facade", nargs=9, type=float, metavar=("X", "Y", "Z") * 3, help=facade)
-    parser.add_argument("--zip", type=Path, metavar="FILE", help="and all of it with the report in one file to send")
-    words, others = parser.parse_known_args(sys.argv[1:])
-    try:
-        project = read_project(read_settings(*_settings_files()[0]))
-    except StageError as error:
-        sys.exit(f"error: {error}")
-    # Results of rows that were removed or renamed stay.
-    finished, missing = (
-        [name for name in names if Path(f"results/objects/{name}/fused.ply").is_file() == there]
-        for names, there in ((project.objects, True), (words.names or (), False))
-    )
-    if missing or not finished:
-        which = f"results/objects/{missing[0]}/fused.ply is not" if missing else "no results/objects/NAME/fused.ply is"
-        sys.exit(f"error: {which} here ({Path.cwd()}); run the workflow first (scenefuse run)")
-    names = sorted(words.names or finished)
-    if words.zip and not REPORT.is_file():
-        sys.exit(f"error: --zip needs {REPORT}, which is not here; run the workflow to its end first (scenefuse run)")
-    if words.facade:
-        if len(names) > 1:
-            sys.exit("error: --facade is of one object; name it by --object")
-        import numpy as np
-
-        from scenefuse.core.transforms import along_a_line
-
-        # Once they are kept, every export draws them.
-        if along_a_line(np.reshape(words.facade, (3, 3))):
-            sys.exit("error: the three points of --facade lie in a line; click three of its corners")
-        Path(f"results/objects/{names[0]}/facade.txt").write_text(" ".join(map(str, words.facade)))
-    scenes = sorted(name for name in project.scenes if Path(f"results/scenes/{name}/dense.ply").is_file())
-    # Given clouds have no cameras, and a scene that was not completed has no tiles.
-    needed = {"cameras": "results/*/*/undistorted", "tiles": "results/scenes/*/completed.ply", "pdf": str(REPORT)}
-    what = [item for item in words.what if any(Path().glob(needed.get(item, "*")))]
-    targets = {EXPORTS[item].format(object=name, scene=scene) for item in what for name in names for scene in scenes}
-    targets = {t for t in targets if not t.endswith("/tiles") or Path(t).with_name("completed.ply").is_file()}
-    run = [sys.executable, "-m", "scenefuse", "run"]
-    rules = ["make_surface", "draw_surface", "export_cameras", "make_tiles", "write_pdf"]
-    ended = subprocess.run([*run, *sorted(targets), *others, "--allowed-rules", *rules]).returncode
-    if ended or {"-n", "--dry-run", "--dryrun"} & set(others):
-        sys.exit(ended)
-    name, scene = ("{" + ",".join(found) + "}" if len(found) > 1 else found[0] for found in (names, scenes))
-    print("Export:", ", ".join(EXPORTS[item].format(object=name, scene=scene) for item in what), flush=True)
-    if REPORT.is_file():
-        from scenefuse.report.facts import closing_lines
-
-        # The page shows what was exported. A run that makes it says where it is.
-        shown = REPORT.stat().st_mtime
-        page = [*run, str(REPORT), *others, "--quiet", "all", "--allowed-rules", "write_report"]
-        ended = subprocess.run(page).returncode
-        if not ended and REPORT.stat().st_mtime == shown:
-            print(closing_lines(REPORT.parent), flush=True)
-    if words.zip and not ended:
-        from scenefuse.report.pack import write_zip
-
-        try:
-            write_zip(REPORT, map(Path, targets), words.zip)
-        except OSError as error:
-            sys.exit(f"error: {error}")
-        print(f"To send: {words.zip} ({words.zip.stat().st_size / 1e6:.0f} MB); unpacked, open its {REPORT.name}")
-    sys.exit(ended)
+    sys.exit(export(sys.argv[1:], _settings_files()[0]))
 
 
 def _run() -> None:
@@ -230,14 +158,6 @@ def _complete() -> None:
     run(complete)
 
 
-# What is handed over.
-EXPORTS = {
-    "surface": "results/objects/{object}/surface.glb",
-    "drawings": "results/objects/{object}/drawings",
-    "cameras": "results/scenes/{scene}/cameras",
-    "tiles": "results/scenes/{scene}/tiles",
-    "pdf": "results/summary/report.pdf",
-}
 PARTS: dict[str, Callable[[], None]] = {
     "complete": _complete,
     "register": _register,

@@ -1,0 +1,123 @@
+"""`scenefuse export`: what is handed over of finished objects, and one file with all of it."""
+
+import argparse
+import re
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZipFile
+
+import numpy as np
+
+from scenefuse.core.project import read_project
+from scenefuse.core.settings import read_settings
+from scenefuse.core.stage import StageError, atomic_file
+from scenefuse.core.transforms import along_a_line
+
+EXPORTS = {
+    "surface": "results/objects/{object}/surface.glb",
+    "drawings": "results/objects/{object}/drawings",
+    "cameras": "results/scenes/{scene}/cameras",
+    "tiles": "results/scenes/{scene}/tiles",
+    "pdf": "results/summary/report.pdf",
+}
+RULES = ("make_surface", "draw_surface", "export_cameras", "make_tiles", "write_pdf")
+REPORT = Path("results/summary/report.html")
+RUN = (sys.executable, "-m", "scenefuse", "run")
+
+
+def export(arguments: list[str], settings_files: list[Path]) -> int:
+    """Make surfaces, drawings, cameras, tiles and a PDF, renew the report page, and pack it; the exit status.
+
+    Args:
+        arguments: of the command line; those that are not its own go to Snakemake.
+        settings_files: of the project.
+    """
+    words, others = _parse(arguments)
+    try:
+        project = read_project(read_settings(*settings_files))
+    except StageError as error:
+        sys.exit(f"error: {error}")
+    # Results of rows that were removed or renamed stay.
+    finished, missing = (
+        [name for name in names if Path(f"results/objects/{name}/fused.ply").is_file() == there]
+        for names, there in ((project.objects, True), (words.names or (), False))
+    )
+    if missing or not finished:
+        which = f"results/objects/{missing[0]}/fused.ply is not" if missing else "no results/objects/NAME/fused.ply is"
+        sys.exit(f"error: {which} here ({Path.cwd()}); run the workflow first (scenefuse run)")
+    if words.zip and not REPORT.is_file():
+        sys.exit(f"error: --zip needs {REPORT}, which is not here; run the workflow to its end first (scenefuse run)")
+    names = sorted(words.names or finished)
+    if words.facade:
+        if len(names) > 1:
+            sys.exit("error: --facade is of one object; name it by --object")
+        # Once they are kept, every export draws them.
+        if along_a_line(np.reshape(words.facade, (3, 3))):
+            sys.exit("error: the three points of --facade lie in a line; click three of its corners")
+        Path(f"results/objects/{names[0]}/facade.txt").write_text(" ".join(map(str, words.facade)))
+    scenes = sorted(name for name in project.scenes if Path(f"results/scenes/{name}/dense.ply").is_file())
+    # Given clouds have no cameras, and a scene that was not completed has no tiles.
+    needed = {"cameras": "results/*/*/undistorted", "tiles": "results/scenes/*/completed.ply", "pdf": str(REPORT)}
+    what = [item for item in words.what if any(Path().glob(needed.get(item, "*")))]
+    targets = {EXPORTS[item].format(object=name, scene=scene) for item in what for name in names for scene in scenes}
+    targets = {t for t in targets if not t.endswith("/tiles") or Path(t).with_name("completed.ply").is_file()}
+    ended = subprocess.run([*RUN, *sorted(targets), *others, "--allowed-rules", *RULES]).returncode
+    if ended or {"-n", "--dry-run", "--dryrun"} & set(others):
+        return ended
+    name, scene = ("{" + ",".join(found) + "}" if len(found) > 1 else found[0] for found in (names, scenes))
+    print("Export:", ", ".join(EXPORTS[item].format(object=name, scene=scene) for item in what), flush=True)
+    ended = _renew_report(others) if REPORT.is_file() else 0
+    if words.zip and not ended:
+        try:
+            write_zip(REPORT, map(Path, targets), words.zip)
+        except OSError as error:
+            sys.exit(f"error: {error}")
+        print(f"To send: {words.zip} ({words.zip.stat().st_size / 1e6:.0f} MB); unpacked, open its {REPORT.name}")
+    return ended
+
+
+def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
+    """The options of an export, and those that are Snakemake's."""
+    parser = argparse.ArgumentParser(
+        prog="scenefuse export",
+        description="Make surfaces, drawings, cameras, tiles and a PDF of finished objects, shown in the report."
+        " Nothing before them runs again.",
+        epilog="All other options are those of scenefuse run, as -n to see what would be made.",
+    )
+    parser.add_argument("--what", nargs="+", choices=EXPORTS, default=list(EXPORTS), help="default: all of them")
+    parser.add_argument("--object", nargs="+", dest="names", metavar="NAME", help="default: all that are finished")
+    facade = "three points of a facade of one object, to draw it as well"
+    parser.add_argument("--facade", nargs=9, type=float, metavar=("X", "Y", "Z") * 3, help=facade)
+    parser.add_argument("--zip", type=Path, metavar="FILE", help="and all of it with the report in one file to send")
+    return parser.parse_known_args(arguments)
+
+
+def _renew_report(others: list[str]) -> int:
+    """Show in the page what was exported; the exit status. A run that makes the page prints where it is."""
+    from scenefuse.report.facts import closing_lines
+
+    shown = REPORT.stat().st_mtime
+    page = [*RUN, str(REPORT), *others, "--quiet", "all", "--allowed-rules", "write_report"]
+    ended = subprocess.run(page).returncode
+    if not ended and REPORT.stat().st_mtime == shown:
+        print(closing_lines(REPORT.parent), flush=True)
+    return ended
+
+
+def write_zip(page: Path, exported: Iterable[Path], file: Path) -> None:
+    """Write a ZIP archive with the page at its top and, in their folders, what it links to, so that its links work.
+
+    Args:
+        page: results/summary/report.html; its links to results begin with "../".
+        exported: files and folders of the results that go with it, linked or not.
+        file: the archive; one that is there is replaced.
+    """
+    results, text = page.parent.parent, page.read_text(encoding="utf-8")
+    given = {*exported, *(results / link for link in re.findall(r'href="\.\./([^"#]+)"', text))}
+    files = {path for top in given for path in ([top] if top.is_file() else top.rglob("*")) if path.is_file()}
+    with atomic_file(file) as temporary, ZipFile(temporary, "w", ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr(page.name, text.replace('href="../', 'href="'))
+        for path in sorted(files):
+            archive.write(path, path.relative_to(results))
