@@ -265,6 +265,17 @@ def test_two_clicked_points_are_measured_in_the_scenes_unit(opened):
     assert opened.find(f"{SECTION} output").text == ""
 
 
+def test_a_length_between_points_whose_deviations_are_unknown_is_known_to_the_scale_at_best(opened):
+    ready(opened, "shed")
+    choose(opened, "Measure", "shed")
+    stage = opened.find("[aria-label='3D view of shed'] .view-stage")
+    for x in (-60, 60):
+        click(opened, stage, stage.size["width"] / 2 + x, stage.size["height"] / 2)
+    said = opened.find("[aria-label='3D view of shed'] output").text
+    found = re.fullmatch(r"([\d.]+) ± ([\d.]+) m or more", said)
+    assert found and float(found[2]) == pytest.approx(0.05 * float(found[1]), rel=0.05), said
+
+
 def test_dragging_turns_and_the_wheel_zooms_once_the_view_is_in_use(opened):
     stage, first = opened.find(STAGE), opened.picture(STAGE)
     camera = camera_of(opened)

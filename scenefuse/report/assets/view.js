@@ -335,12 +335,13 @@ class View {
   }
 
   distance() {
-    // One standard deviation: of both ends, and of the scale.
+    // One standard deviation: of both ends, as far as it is known, and of the scale.
     const length = norm(minus(...this.picked));
     const spread = Math.hypot(...this.picked.map((point) => point.deviation), this.about.scale_sd * length);
     if (!(spread > 0)) return `${Number(length.toPrecision(4))} ${this.about.unit}`;
     const decimals = Math.max(0, 1 - Math.floor(Math.log10(spread)));
-    return `${length.toFixed(decimals)} ± ${spread.toFixed(decimals)} ${this.about.unit}`;
+    const more = this.picked.every((point) => point.deviation) ? "" : " or more";
+    return `${length.toFixed(decimals)} ± ${spread.toFixed(decimals)} ${this.about.unit}${more}`;
   }
 
   drawMarks() {
