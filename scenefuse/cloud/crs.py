@@ -19,6 +19,8 @@ MAX_BEYOND_DEG = 6.0
 MAX_SITE_COORDINATE = 10_000.0
 # The feet of surveyors and of everybody else differ by less, which is a millimetre of a height.
 MAX_UNIT_RATIO = 1e-5
+# One unit's digits differ by less; two feet, by more.
+SAME_UNIT_RATIO = 1e-7
 MERCATOR = "Mercator's projection, whose metres are no metres on the ground"
 
 
@@ -151,6 +153,15 @@ def unit_m(crs: pyproj.CRS) -> float:
     """Metres in the unit of a CRS's heights, which is that of its plane too where it is projected."""
     axes = crs.axis_info if len(crs.axis_info) > 2 else [] if plane(crs).is_geographic else crs.axis_info
     return float(axes[-1].unit_conversion_factor) if axes else 1.0
+
+
+def unit_name(crs: pyproj.CRS) -> str:
+    """The unit of a projected CRS as the register calls it, "m" for metres; WKT has many words for one foot."""
+    factor, own = (crs.axis_info[0].unit_conversion_factor, crs.axis_info[0].unit_name) if crs.axis_info else (1.0, "")
+    units = get_units_map("EPSG", "linear").values()
+    off, name = min((abs(unit.conv_factor / factor - 1), unit.name) for unit in units)
+    name = name if off < SAME_UNIT_RATIO else own
+    return "m" if name == "metre" else name
 
 
 def grid_name(crs: pyproj.CRS) -> str:

@@ -222,8 +222,9 @@ class ImportedFile:
 
 
 def unit_and_name(crs: "pyproj.CRS | None") -> tuple[str, str | None]:
-    """The unit of a projected CRS, "m" for metres, and its name: an EPSG code where it has one, else its WKT."""
+    """The unit of a projected CRS (`unit_name`), and its name: an EPSG code where it has one, else its WKT."""
     if crs is None:
         return "scene units", None
-    unit = crs.axis_info[0] if crs.axis_info else None
-    return "m" if unit is None or unit.unit_conversion_factor == 1 else unit.unit_name, crs.to_string()
+    from scenefuse.cloud.crs import unit_name
+
+    return unit_name(crs), crs.to_string()

@@ -9,7 +9,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from scenefuse.cloud.crs import crs_name, unit_m
+from scenefuse.cloud.crs import crs_name, unit_m, unit_name
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Sim3, fit_sim3
 
@@ -64,8 +64,7 @@ class LocalFrame:
     @property
     def crs_unit(self) -> str:
         """The unit of `crs`, "m" for metres."""
-        crs = pyproj.CRS.from_user_input(self.crs)
-        return "m" if unit_m(crs) == 1 else crs.axis_info[0].unit_name
+        return unit_name(pyproj.CRS.from_user_input(self.crs))
 
     def in_crs(self, x_in_local: Array) -> Array:
         """(N, 3) east, north, up in metres to (N, 3) easting, northing, altitude in `crs` and its unit, exactly.

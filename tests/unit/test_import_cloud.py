@@ -11,7 +11,7 @@ from support.cloud_files import UTM, write_e57, write_pcd
 from support.copc_file import write_copc
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
-from scenefuse.cloud.import_cloud import import_object_cloud, import_scene_cloud, near_origin
+from scenefuse.cloud.import_cloud import import_object_cloud, import_scene_cloud, near_origin, unit_and_name
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Sim3
@@ -20,6 +20,7 @@ from scenefuse.fuse.fuse_object import possible
 from scenefuse.fuse.modes import FusionSettings
 from scenefuse.fuse.write import frame_ledger
 from scenefuse.photos.geodesy import scene_frame
+from scenefuse.surface.gltf import metres_per_unit
 
 
 @pytest.fixture
@@ -157,6 +158,11 @@ def test_a_crs_of_the_table_that_is_not_the_clouds_is_one_sentence(tmp_path, clo
 def test_feet_are_called_by_their_name(tmp_path, cloud):
     write_laz(tmp_path / "a.laz", Cloud(cloud.points - UTM), np.array([985_000.0, 195_000.0, 0.0]), "EPSG:2263")
     assert value(imported_scene(tmp_path, tmp_path / "a.laz")[2], "length_unit") == "US survey foot"
+    # Whose metres depend on its name, and programs have names of their own.
+    for word, metres, name in (("U.S. Foot", 0.3048006096, "US survey foot"), ("Foot", 0.3048, "foot"), ("m", 1, "m")):
+        wkt = pyproj.CRS.from_epsg(25832).to_wkt("WKT1_GDAL").replace('UNIT["metre",1', f'UNIT["{word}",{metres}')
+        assert unit_and_name(pyproj.CRS.from_wkt(wkt))[0] == name
+        assert metres_per_unit(name) == pytest.approx(metres, rel=1e-9)
 
 
 def test_a_plane_in_feet_with_heights_in_metres_is_refused(tmp_path, cloud):
