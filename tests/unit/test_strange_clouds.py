@@ -770,6 +770,21 @@ def test_a_las_header_whose_coordinates_count_in_no_steps_is_refused(tmp_path, s
         CloudFile.of(tmp_path / "a.las")
 
 
+def test_coordinates_of_las_that_were_cut_off_where_32_bits_end_are_none(tmp_path):
+    las = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
+    las.header.scales, las.header.offsets = [0.001] * 3, [0, 0, 0]  # CloudCompare 2.14 leaves out the offset
+    las.x, las.y, las.z = np.array(GRID).T
+    las.Y[5], las.Y[6] = -(2**31), 2**31 - 1
+    las.write(tmp_path / "a.las")
+    file = CloudFile.of(tmp_path / "a.las")
+    assert np.allclose(file.part.points, np.delete(GRID, [5, 6], axis=0), atol=1e-3)
+    assert "2 rows without a finite position of a.las were left out" in file.notes
+    las.Y[:] = -(2**31)
+    las.write(tmp_path / "a.las")
+    with pytest.raises(StageError, match="holds no point of a surface .40 rows without a finite position"):
+        CloudFile.of(tmp_path / "a.las")
+
+
 @pytest.mark.parametrize(
     ("at", "kind", "number"), [(100, "<I", 2**32 - 1), (247, "<Q", 2**40), (105, "<H", 3), (243, "<I", 1)]
 )

@@ -20,6 +20,8 @@ LAS_DIMENSIONS = {"classification": np.uint8, "intensity": np.uint16}
 # Classes of LAS that are no surface: low and high noise; the flag of points that whoever edited the cloud took out.
 NOISE = (7, 18)
 WITHHELD = "withheld"
+# The least and the greatest number of steps that a coordinate counts.
+ENDS = (np.iinfo(np.int32).min, np.iinfo(np.int32).max)
 
 
 def las_crs(path: Path) -> "pyproj.CRS | None":
@@ -78,10 +80,12 @@ def read_las(path: Path, at_once: int) -> Iterator[Columns]:
             extra = {name: np.asarray(points[name]) for name in form.extra_dimension_names}
             own = {name: np.asarray(points[name]).astype(kind) for name, kind in LAS_DIMENSIONS.items()}
             own[WITHHELD] = np.asarray(points[WITHHELD]) != 0
+            found = {name: np.asarray(points[name]) for name in named}
+            for axis in POSITION:  # coordinates beyond what 32 bits count are cut off there by what wrote the file
+                cut = np.isin(points.array[axis.upper()], ENDS)
+                found[axis] = np.where(cut, np.nan, found[axis]) if cut.any() else found[axis]
             yield (
-                {name: np.asarray(points[name]) for name in named}
-                | own
-                | {name: values for name, values in extra.items() if values.ndim == 1 and name not in own}
+                found | own | {name: values for name, values in extra.items() if values.ndim == 1 and name not in own}
             )
         check_count(path, file.header.point_count, count)
 
