@@ -14,9 +14,10 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
+import pyproj
 from PIL.ExifTags import IFD, Base
 
-from scenefuse.cloud.crs import crs_name
+from scenefuse.cloud.crs import crs_name, unit_name
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.version import VERSION
 from scenefuse.photos.geodesy import given_place, heights_of
@@ -199,10 +200,9 @@ def scene_facts(row: Row) -> dict[str, str]:
         facts["Photographed"] = f"{has.get('photographed', 'undated')}, {used}"
     elif "error" not in has:
         facts["Photographed"] = "given as a cloud"
-    if unit == "m":
-        facts["Coordinates"] = f"metres, {crs_name(has['crs'])}" if "crs" in has else "metres, in a local frame"
-    else:
-        facts["Coordinates"] = f"{unit}, in a local frame"
+    counted = unit_name(pyproj.CRS.from_user_input(has["crs"])) if "crs" in has else unit
+    where = crs_name(has["crs"]) if "crs" in has else "in a local frame"
+    facts["Coordinates"] = f"{_plural(counted)}, {where}"
     if "latitude_deg" in has:
         north, east = has["latitude_deg"], has["longitude_deg"]
         place = f"{abs(north):.5f}° {'NS'[north < 0]}, {abs(east):.5f}° {'EW'[east < 0]}"

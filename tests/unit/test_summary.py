@@ -611,6 +611,13 @@ def test_photos_without_a_date_are_called_undated():
     assert object_facts({"object": "house", "status": "registered"} | row)["Photos"] == "12 of 12 used, undated"
 
 
+@pytest.mark.parametrize("unit", ["m", "US survey foot"])
+def test_coordinates_have_the_name_and_the_unit_of_their_crs_whatever_the_scene_counts_in(unit):
+    feet = "US survey foot, NAD83 / California zone 3 (ftUS) (EPSG:2227)"
+    assert scene_facts({"scene": "yard", "length_unit": unit, "crs": "EPSG:2227"})["Coordinates"] == feet
+    assert scene_facts({"scene": "yard", "length_unit": unit})["Coordinates"].endswith(", in a local frame")
+
+
 def test_lengths_of_an_object_in_a_scene_without_a_scale_are_not_trusted_in_metres():
     row = {"object": "head", "status": "registered", "unit": "scene units", "scale_sd_log": 0.011}
     assert object_facts(row)["Scale"] == "Trust it to 1.1 % (standard deviation), beside the scene's, not in metres"
