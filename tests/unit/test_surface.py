@@ -31,6 +31,7 @@ from scenefuse.photos.workspace import View, read_views, write_model
 from scenefuse.report import facts
 from scenefuse.report.facts import surface_facts
 from scenefuse.report.write_pdf import write_pdf
+from scenefuse.surface import drawings as drawn
 from scenefuse.surface import tiles
 from scenefuse.surface.cameras import export_cameras
 from scenefuse.surface.drawings import NOTHING, SIDES, draw, draw_surface, facade_axes, wall_turn
@@ -369,6 +370,14 @@ def test_a_drawing_names_its_day_and_a_plan_its_crs_with_an_arrow_to_the_north(d
         assert not re.search(r"^N\b", plain, re.MULTILINE)
         # Where no CRS says where it lies, its sides have their names by the axes.
         assert ("y taken for north" in plain) == (side != "above") and "y taken for north" not in page
+
+
+def test_a_drawing_of_many_pixels_is_drawn_strip_by_strip_like_one_of_few(closed, monkeypatch):
+    whole = draw(closed, None, np.eye(3), 0.02)
+    monkeypatch.setattr(drawn, "AT_ONCE", 700)
+    strips = draw(closed, None, np.eye(3), 0.02)
+    for name, band in vars(whole).items():
+        np.testing.assert_array_equal(band, vars(strips)[name])
 
 
 def test_a_facade_is_drawn_of_the_plane_through_three_points_from_outside(coarse, placed):
