@@ -535,6 +535,50 @@ def test_a_mesh_in_ply_has_the_colours_of_its_textures_or_faces(tmp_path, text, 
     assert (left, right) == pytest.approx((0.25, 0.75), abs=0.01) and normal == pytest.approx([0, 0, 1])
 
 
+def paint(document, primitive, color):
+    """Give the four corners of a glTF's primitive a colour."""
+    data = b64encode(np.full((4, 3), color, "<f4").tobytes()).decode()
+    document["buffers"] = [{"byteLength": 0}, {"byteLength": 48, "uri": f"data:;base64,{data}"}]
+    document["bufferViews"].append({"buffer": 1, "byteLength": 48})
+    view = len(document["bufferViews"]) - 1
+    document["accessors"].append({"bufferView": view, "componentType": 5126, "count": 4, "type": "VEC3"})
+    primitive["attributes"]["COLOR_0"] = len(document["accessors"]) - 1
+
+
+@pytest.mark.parametrize("form", ["obj", "glb"])
+def test_of_a_mesh_s_parts_each_has_its_colours_of_vertices_texture_or_material(tmp_path, form):
+    path = tmp_path / f"a.{form}"
+    if form == "obj":
+        halves(tmp_path / "t.png")
+        (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd t.png\nnewmtl k\nKd 0 1 0\n")
+        text = f"mtllib a.mtl\n{SQUARE}usemtl m\nf 1/1 2/2 3/3 4/4\n"
+        text += "".join(f"v {x + 10} {y} 0 0 1 1\n" for x, y, _ in CORNERS) + "usemtl none\nf 5 6 7 8\n"
+        text += "".join(f"v {x + 20} {y} 0\n" for x, y, _ in CORNERS) + "usemtl k\nf 9 10 11 12\n"
+        path.write_text(text)
+    else:
+
+        def change(document):
+            for k, material in enumerate([{"pbrMetallicRoughness": {"baseColorFactor": [0, 1, 0, 1]}}, {}], 1):
+                plain = {"attributes": {"POSITION": 0}, "indices": 2, "material": k}
+                document["materials"].append(material)
+                document["meshes"].append({"primitives": [plain]})
+                document["nodes"].append({"mesh": k, "translation": [30 - 10 * k, 0, 0]})
+            paint(document, document["meshes"][2]["primitives"][0], (0, 1, 1))
+            document["scenes"] = [{"nodes": [0, 1, 2]}]
+
+        glb(path, change)
+    read = read_cloud(path)
+    part = (read.points[:, 0] // 10).astype(int)
+    assert np.array_equal(np.unique(read.colors[part == 0], axis=0), [[0, 0, 255], [255, 0, 0]])
+    assert (read.colors[part == 1] == [0, 255, 255]).all() and (read.colors[part == 2] == [0, 255, 0]).all()
+
+
+def test_materials_that_are_not_there_leave_the_colours_of_vertices(tmp_path):
+    corners = "".join(f"v {x} {y} 0 0 1 1\n" for x, y, _ in CORNERS)
+    (tmp_path / "a.obj").write_text(f"mtllib gone.mtl\n{corners}usemtl a\nf 1 2 3\nusemtl b\nf 1 3 4\n")
+    assert (read_cloud(tmp_path / "a.obj").colors == [0, 255, 255]).all()
+
+
 @pytest.mark.parametrize("form", ["obj", "ply", "glb"])
 def test_a_texture_is_not_hidden_by_vertices_that_are_white(tmp_path, form):
     halves(tmp_path / "t.png")
@@ -550,19 +594,7 @@ def test_a_texture_is_not_hidden_by_vertices_that_are_white(tmp_path, form):
         faces = "element face 1\nproperty list uchar int vertex_indices\ncomment TextureFile t.png\nend_header\n"
         path.write_text(HEAD.format(4) + more + faces + rows + "4 0 1 2 3\n")
     else:
-
-        def change(document):
-            white = np.full((4, 3), 1, "<f4").tobytes()
-            document["buffers"] = [
-                {"byteLength": 0},
-                {"byteLength": 48, "uri": f"data:;base64,{b64encode(white).decode()}"},
-            ]
-            document["bufferViews"].append({"buffer": 1, "byteLength": 48})
-            accessor = {"bufferView": len(document["bufferViews"]) - 1, "componentType": 5126, "count": 4}
-            document["accessors"].append(accessor | {"type": "VEC3"})
-            document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = len(document["accessors"]) - 1
-
-        glb(path, change)
+        glb(path, lambda document: paint(document, document["meshes"][0]["primitives"][0], (1, 1, 1)))
     assert sides(path)[:2] == pytest.approx([0.25, 0.75], abs=0.01)
 
 

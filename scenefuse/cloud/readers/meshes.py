@@ -55,7 +55,7 @@ class Mesh:
     Attributes:
         vertices: (V, 3) positions.
         faces: (F, 3) rows of `vertices`.
-        colors: (V, 3) 0..255, or None.
+        colors: (V, 3) 0..255, NaN where there are none; or None.
         uvs: (F, 3, 2) places in the material's picture, from its lower left corner; NaN where there are none; or None.
         material: (F,) rows of `materials`, -1 for none.
         materials: of the faces.
@@ -108,18 +108,18 @@ def _colors(mesh: Mesh, face: NDArray[np.int64], weights: Array) -> Array | None
     """(N, 3) colours at points of faces (N,) with barycentric weights (N, 3): of a picture, else the vertices, else the
     material. Beside materials, programs write white for vertices that have none."""
     plain = all(material.picture is None and material.color == Material.color for material in mesh.materials)
-    own = None if mesh.colors is None or (mesh.colors.min() == 255 and not plain) else mesh.colors
+    own = None if mesh.colors is None or not ((mesh.colors < 255).any() or plain) else mesh.colors
     if own is None and plain:
         if mesh.materials:
             print("note: the mesh's materials have neither pictures nor colours: it has none", flush=True)
         return None
-    colors, of = np.full((len(face), 3), 255.0), mesh.material[face]
+    of = np.where(mesh.material < len(mesh.materials), mesh.material, -1)[face]
+    colors = np.array([*(material.color for material in mesh.materials), Material.color])[of]
     if own is not None:
-        colors = np.einsum("nk,nkc->nc", weights, own[mesh.faces[face]])
+        at = np.einsum("nk,nkc->nc", weights, own[mesh.faces[face]])
+        colors = np.where(np.isfinite(at), at, colors)
     for number, material in enumerate(mesh.materials):
         rows = np.flatnonzero(of == number)
-        if own is None:
-            colors[rows] = material.color
         if material.picture is None or mesh.uvs is None:
             continue
         uv = np.einsum("nk,nkc->nc", weights[rows], mesh.uvs[face[rows]])
@@ -228,12 +228,12 @@ def read_obj(path: Path) -> Columns:
             libraries.append(rest.strip())
     if not vertices:
         return {axis: np.empty(0) for axis in "xyz"}
-    width = 6 if min(map(len, vertices)) >= 6 else 3
-    table = np.array([vertex[:width] for vertex in vertices], np.float64)
-    colors = bytes_of(table[:, 3:]) if width == 6 else None
+    # A file of several objects may have colours of some.
+    table = np.array([vertex[:6] if len(vertex) >= 6 else [*vertex[:3], *[np.nan] * 3] for vertex in vertices])
+    painted = np.isfinite(table[:, 3:]).all(1)
     if not polygons:
         columns: Columns = dict(zip("xyz", table[:, :3].T))
-        return columns if colors is None else columns | dict(zip(COLOR, colors.T))
+        return columns | dict(zip(COLOR, bytes_of(table[:, 3:]).T)) if painted.all() else columns
     rows, at = (np.fromiter(chain.from_iterable(some), np.int64) for some in (polygons, places))
     corners, of = triangles(np.array(list(map(len, polygons))), rows, table[:, :3])
     files = [file for name in libraries for file in _libraries(path.parent, name)]
@@ -243,7 +243,7 @@ def read_obj(path: Path) -> Columns:
         Mesh(
             table[:, :3],
             rows[corners],
-            None if colors is None else colors.astype(np.float64),
+            np.where(painted[:, None], bytes_of(table[:, 3:]), np.nan) if painted.any() else None,
             np.array([*uvs, [np.nan, np.nan]], np.float64)[at[corners]],
             np.array([names.index(name) for name in used])[of],
             tuple(known.get(name, Material()) for name in names) if known else (),
@@ -372,12 +372,12 @@ def read_gltf(path: Path) -> Columns:
     if not parts:
         raise ValueError("it holds no triangles")
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
-    colored = [part.colors for part in parts if part.colors is not None]
+    colors = [np.full(part.vertices.shape, np.nan) if part.colors is None else part.colors for part in parts]
     return sampled_columns(
         Mesh(
             np.concatenate([part.vertices for part in parts]),
             np.concatenate([part.faces + start for part, start in zip(parts, starts)]),
-            np.concatenate(colored) if len(colored) == len(parts) else None,
+            None if all(part.colors is None for part in parts) else np.concatenate(colors),
             np.concatenate([np.full((len(p.faces), 3, 2), np.nan) if p.uvs is None else p.uvs for p in parts]),
             np.concatenate([part.material for part in parts]),
             tuple(content.material(number) for number in range(len(document.get("materials", [])))),
