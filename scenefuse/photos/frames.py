@@ -1,7 +1,9 @@
 """A scene's photos, upright, and an object's frames: of a folder of photos, or the sharpest frames of a video."""
 
 import os
+import re
 import shutil
+import struct
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
@@ -215,6 +217,8 @@ def _from_video(
         raise StageError(
             f"{source} is neither a folder of photos nor a video; use one of {' '.join(sorted(VIDEO_SUFFIXES))}"
         )
+    if _is_panorama(source):
+        raise StageError(f"the video {source} is a panorama, to which no lens is fitted: cut it into views")
     cv2.setNumThreads(threads())
     seconds = [at for at, _ in _decode(source, pictures=False)]
     if not seconds:
@@ -236,6 +240,20 @@ def _from_video(
         listed = [replace(photo, **asdict(position)) for photo, position in zip(listed, positions)]
         notes.append(note)
     return listed, origin, notes
+
+
+def _is_panorama(source: Path) -> bool:
+    """Whether an MP4 or MOV says so, by Google's Spherical Video RFC, version 1 or 2."""
+    with open(source, "rb") as file:
+        while len(head := file.read(8)) == 8:
+            size, kind = struct.unpack(">I4s", head)
+            size = int.from_bytes(file.read(8), "big") - 8 if size == 1 else size
+            if kind == b"moov":
+                return re.search(rb"GSpherical:Spherical>\s*true|sv3d.{4}svhd", file.read(size), re.DOTALL) is not None
+            if size < 8:  # 0 is for a box up to the end
+                break
+            file.seek(size - 8, os.SEEK_CUR)
+    return False
 
 
 def video_size(source: Path) -> tuple[int, int, int]:

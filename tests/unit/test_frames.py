@@ -161,6 +161,29 @@ def test_a_video_that_was_filmed_upright_is_stood_upright(tmp_path):
     assert {(photo.width, photo.height) for photo in listed(tmp_path, path)[0]} == {(96, 128)}
 
 
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_video_that_is_a_panorama_is_refused(tmp_path, version):
+    content = film(tmp_path / "insta.mp4").read_bytes()
+    # As cameras of 360 degrees write it: in the track, or in the description of its pictures.
+    said = bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + b"<GSpherical:Spherical>true</GSpherical:Spherical>"
+    box = b"uuid" + said if version == 1 else b"sv3d" + struct.pack(">I4s", 16, b"svhd") + bytes(8)
+    box = struct.pack(">I", 4 + len(box)) + box
+    moov = content.index(b"moov") - 4
+    assert moov > content.index(b"mdat")
+    size = int.from_bytes(content[moov : moov + 4], "big")
+    path = tmp_path / "pano.mp4"
+    path.write_bytes(
+        content[:moov]
+        + struct.pack(">I", size + len(box))
+        + content[moov + 4 : moov + size]
+        + box
+        + content[moov + size :]
+    )
+    assert video_size(path) == video_size(tmp_path / "insta.mp4")
+    with pytest.raises(StageError, match=r"the video .*pano\.mp4 is a panorama, to which no lens is fitted"):
+        listed(tmp_path, path)
+
+
 @pytest.mark.parametrize(
     ("name", "frames", "sentence"),
     [
