@@ -26,14 +26,12 @@ from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
 from scenefuse.photos.sheets import round_below
 from scenefuse.surface.gltf import BRIDGED_TINT, Painted, metres_per_unit, read_painted
 from scenefuse.surface.make_surface import read_surface
-from scenefuse.surface.mesh import FaceClass, Surface, cast, caster
+from scenefuse.surface.mesh import AT_ONCE, FaceClass, Surface, cast, caster
 from scenefuse.surface.texture import MAX_SIDE_PX
 
 # Width and height of a page, A3, and of what is drawn on it at most, metres.
 PAGE, DRAWN = np.array([0.42, 0.297]), np.array([0.37, 0.247])
 COLORS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
-# Pixels that are drawn at once: each takes 200 bytes then, and 13 afterwards.
-AT_ONCE = 4_000_000
 # Value of the class band where nothing is.
 NOTHING = 255
 # Axes of drawings, right and up, by the side that they are seen from; a drawing's third axis points at the viewer.

@@ -31,6 +31,8 @@ MAX_POINTS = 1_000_000
 # Widest gap that is bridged, as a share of the diagonal: where a surface bends by a right angle in the middle of a gap,
 # it passes at half the width from what closes it, which is 1 % at most.
 MAX_GAP = 2 * MARGIN
+# Rays that are cast at once for the pixels of a picture: each takes 200 bytes.
+AT_ONCE = 4_000_000
 # The candidate reaches so far beyond the points' box, as a share of its longest side.
 BEYOND_BOX = 1.1
 

@@ -20,7 +20,7 @@ from scenefuse.fuse.write import GAINS
 from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS, MIN_COSINE
 from scenefuse.photos.frames import sharpness
 from scenefuse.photos.workspace import View
-from scenefuse.surface.mesh import FaceClass, Rows, Surface, cast, caster, normals_of
+from scenefuse.surface.mesh import AT_ONCE, FaceClass, Rows, Surface, cast, caster, normals_of
 
 # Faces that a textured surface is simplified to: what is finer is in its picture, and to unfold more takes minutes.
 TEXTURED_FACES = 40_000
@@ -223,12 +223,15 @@ def _texels(points: Array, faces: Rows, uv: Array, side: int) -> tuple[Rows, Arr
     (T, 3) that they show."""
     flat = np.column_stack([uv.reshape(-1, 2) * side, np.zeros(3 * len(faces))])
     scene = caster(flat, np.arange(len(flat)).reshape(-1, 3))
-    column, row = (a.ravel() for a in np.meshgrid(np.arange(side), np.arange(side)))
-    origins = np.column_stack([column + 0.5, row + 0.5, np.full(len(row), -1.0)])
-    hit = cast(scene, origins, np.tile([0.0, 0, 1], (len(row), 1)))
-    on = np.isfinite(hit["t_hit"])
-    face = hit["primitive_ids"][on].astype(np.int64)
-    b, c = hit["primitive_uvs"][on].T
-    weights = np.column_stack([1 - b - c, b, c])
-    places = (points[faces[face]] * weights[..., None]).sum(1)
-    return np.column_stack([column[on], row[on], face]), weights, places
+    texels, weights, places = list[Rows](), list[Array](), list[Array]()
+    for rows in np.array_split(np.arange(side), -(-(side**2) // AT_ONCE)):
+        column, row = (a.ravel() for a in np.meshgrid(np.arange(side), rows))
+        origins = np.column_stack([column + 0.5, row + 0.5, np.full(len(row), -1.0)])
+        hit = cast(scene, origins, np.tile([0.0, 0, 1], (len(row), 1)))
+        on = np.isfinite(hit["t_hit"])
+        face = hit["primitive_ids"][on].astype(np.int64)
+        b, c = hit["primitive_uvs"][on].T
+        weights.append(np.column_stack([1 - b - c, b, c]))
+        places.append((points[faces[face]] * weights[-1][..., None]).sum(1))
+        texels.append(np.column_stack([column[on], row[on], face]))
+    return np.concatenate(texels), np.concatenate(weights), np.concatenate(places)

@@ -32,7 +32,7 @@ from scenefuse.report import facts
 from scenefuse.report.facts import surface_facts
 from scenefuse.report.write_pdf import write_pdf
 from scenefuse.surface import drawings as drawn
-from scenefuse.surface import tiles
+from scenefuse.surface import texture, tiles
 from scenefuse.surface.cameras import export_cameras
 from scenefuse.surface.drawings import NOTHING, SIDES, draw, draw_surface, facade_axes, wall_turn
 from scenefuse.surface.gltf import Painted, earth_from_scene, write_glb
@@ -378,6 +378,17 @@ def test_a_drawing_of_many_pixels_is_drawn_strip_by_strip_like_one_of_few(closed
     strips = draw(closed, None, np.eye(3), 0.02)
     for name, band in vars(whole).items():
         np.testing.assert_array_equal(band, vars(strips)[name])
+
+
+def test_texels_of_many_pixels_are_found_strip_by_strip_like_those_of_few(monkeypatch):
+    square, faces = (
+        np.array([[0.1, 0.1, 0], [0.9, 0.1, 0], [0.9, 0.8, 1], [0.1, 0.8, 1]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    )
+    whole = texture._texels(square, faces, square[faces][..., :2], 100)
+    monkeypatch.setattr(texture, "AT_ONCE", 700)
+    for a, b in zip(whole, texture._texels(square, faces, square[faces][..., :2], 100)):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_a_facade_is_drawn_of_the_plane_through_three_points_from_outside(coarse, placed):
