@@ -135,6 +135,12 @@ def has_place(crs: str | None) -> bool:
     return crs is not None and not plane(pyproj.CRS.from_user_input(crs)).is_engineering
 
 
+def points_north(crs: str) -> bool:
+    """Whether y of a CRS counts to the north: South Africa's counts to the south, and x to the west."""
+    axes = plane(pyproj.CRS.from_user_input(crs)).axis_info[:2]
+    return {axis.direction for axis in axes} == {"east", "north"}
+
+
 def crs_name(crs: str) -> str:
     """The name of a coordinate system, with its code."""
     try:

@@ -9,7 +9,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from scenefuse.cloud.crs import crs_name, unit_m, unit_name
+from scenefuse.cloud.crs import crs_name, points_north, unit_m, unit_name
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Sim3, fit_sim3
 
@@ -60,6 +60,11 @@ class LocalFrame:
             return self.grid
         zone = min(int((self.longitude_deg + 180.0) // 6.0) + 1, 60)
         return f"EPSG:{(32600 if self.latitude_deg >= 0 else 32700) + zone}"
+
+    @property
+    def has_north(self) -> bool:
+        """Whether y is known to point north."""
+        return True
 
     @property
     def crs_unit(self) -> str:
@@ -131,6 +136,11 @@ class GridFrame:
 
     crs: str | None
     origin: Array
+
+    @property
+    def has_north(self) -> bool:
+        """Whether y is known to point north."""
+        return self.crs is not None and points_north(self.crs)
 
     def in_crs(self, x_in_local: Array) -> Array:
         """(N, 3) points of the frame in the file's coordinates."""

@@ -17,7 +17,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud
 from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array, box_corners
-from scenefuse.photos.geodesy import length_unit
+from scenefuse.photos.geodesy import length_unit, scene_frame
 from scenefuse.photos.sheets import TILE_PX, Cell, draw_scale, draw_sheet, save_png
 from scenefuse.photos.workspace import View as PhotoView
 from scenefuse.photos.workspace import read_views
@@ -67,8 +67,8 @@ def draw_scene(
     note = f"{len(scene):,} points{drawn}, objects (boxes): {len(boxes)}, "
     note += f"cameras (red): {len(views)}" if georeferenced else "given as a cloud"
     errors = pd.DataFrame() if residuals is None else read_table(residuals)
-    known = {} if georeference_json is None else read_json(georeference_json)
-    place = length_unit(georeference_json), known.get("crs", {}).get("value") is not None
+    frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
+    place = length_unit(georeference_json), frame is not None and frame.has_north
     save_png(figure, _scene_sheet(f"Scene {name}", note, cloud, views, boxes, errors, place))
 
 

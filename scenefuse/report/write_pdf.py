@@ -159,5 +159,5 @@ class _Page(FPDF):
         self.line(self.l_margin, self.get_y(), self.l_margin + bar * per_unit, self.get_y())
         self.ln(1)
         ratio = "" if unit == "scene units" else f"1:{scale} on A4; "
-        north = "" if value(known, "crs") else "; y taken for north"
+        north = "" if value(known, "has_north") else "; y taken for north"
         self.cell(0, 5, f"{ratio}bar: {length(bar, unit)}; white: not measured{north}", new_x="LMARGIN", new_y="NEXT")

@@ -17,7 +17,7 @@ from rasterio.enums import ColorInterp
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.crs import crs_name
+from scenefuse.cloud.crs import crs_name, points_north
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, threads, write_json
 from scenefuse.core.transforms import UP, Array, along_a_line
 from scenefuse.fuse.compare import MARGIN
@@ -185,7 +185,7 @@ def draw_surface(
     frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
     # Of the CRS in one of the scene, which counts in metres where its CRS may in feet.
     per_unit = 1.0 if frame is None else float(np.ptp(frame.in_crs(UP * np.arange(2)[:, None])[:, 2]))
-    has_north = frame is not None and frame.crs is not None
+    has_north = frame is not None and frame.has_north
     with atomic_directory(folder) as output:
         pages = PdfPages(output / "drawings.pdf", metadata={"CreationDate": None})
         for side, axes in _axes_of(whole, turn, facade).items() if len(whole.faces) else ():
@@ -209,6 +209,8 @@ def draw_surface(
             _write_bands(output / side, drawing, crs, shift)
             towards = f", looking towards {np.degrees(np.arctan2(-axes[2, 0], -axes[2, 1])) % 360:.0f}°"
             towards += "" if has_north else ", y taken for north"
+            if abs(axes[2] @ UP) > 1 - MARGIN:
+                towards = f", looking {'down' if axes[2] @ UP > 0 else 'up'}"
             scale = _scale(drawing, metres / ratio)
             where = {"above": "plan", "facade": "facade"}.get(side, f"elevation from the {side}")
             title = f"{name}, {where}{'' if side == 'above' else towards}"
@@ -223,6 +225,7 @@ def draw_surface(
             pages.savefig(Figure(figsize=(1, 1)))
         pages.close()
         report |= {"wall_turn": quantity(float(np.degrees(turn)), "deg"), "crs": quantity(frame and frame.crs, "")}
+        report["has_north"] = quantity(has_north, "")
         write_json(output / "drawings.json", report)
 
 
@@ -287,7 +290,7 @@ def _sheet(
         unit: of lengths.
         page_per_unit: metres of the page for a unit.
         corner: what the frame says of its upper left.
-        crs: whose north is up; None for another drawing.
+        crs: of a plan, whose north is up where y points there; None for another drawing.
     """
     inch = 0.0254
     height, width = (side * drawing.pixel for side in drawing.classes.shape)
@@ -310,5 +313,6 @@ def _sheet(
     figure.text(left, low - 0.02, f"purple: interpolated; grey: not measured; drawn {date.today()}", fontsize=8)
     if crs is not None:
         figure.text(left, low - 0.04, crs_name(crs), fontsize=8)
+    if crs is not None and points_north(crs):
         axes.annotate("N", (1.03, 1), (1.03, 0.9), "axes fraction", ha="center", arrowprops={"arrowstyle": "-|>"})
     return figure

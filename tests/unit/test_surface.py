@@ -372,6 +372,17 @@ def test_a_drawing_names_its_day_and_a_plan_its_crs_with_an_arrow_to_the_north(d
         assert ("y taken for north" in plain) == (side != "above") and "y taken for north" not in page
 
 
+def test_a_plan_has_no_arrow_to_the_north_where_y_points_south_and_of_a_level_facade_one_looks_down(coarse, tmp_path):
+    here = {"crs": quantity("EPSG:2048", ""), "origin_in_crs": quantity([1e4, 3.7e6, 300.0], "m")}
+    write_json(tmp_path / "g.json", GEOREFERENCE | here)
+    level = np.array([[0, 0, 1.0], [0.1, 0, 1], [0, 0.1, 1]])
+    folder = ball_drawn(coarse, tmp_path, georeference_json=tmp_path / "g.json", facade=tuple(level.ravel()))
+    pages = [page.get_textpage().get_text_bounded() for page in pypdfium2.PdfDocument(folder / "drawings.pdf")]
+    assert not any(re.search(r"^N\b", page, re.MULTILINE) for page in pages)
+    assert ["y taken for north" in page for page in pages] == [False, True, True, True, True, False]
+    assert "facade, looking down; 1:" in pages[-1]
+
+
 def test_a_drawing_of_many_pixels_is_drawn_strip_by_strip_like_one_of_few(closed, monkeypatch):
     whole = draw(closed, None, np.eye(3), 0.02)
     monkeypatch.setattr(drawn, "AT_ONCE", 700)

@@ -415,12 +415,15 @@ def test_the_scene_s_sheet_has_an_arrow_to_the_north_in_a_crs_only(capture, tmp_
     figure, about = tmp_path / "scene.png", tmp_path / "georeference.json"
 
     def drawn(crs):
-        write_json(about, {"length_unit": quantity("m", ""), "crs": quantity(crs, "")})
+        place = {"crs": quantity(crs, ""), "origin_in_crs": quantity([4e5, 5e6, 0.0], "m")}
+        write_json(about, {"length_unit": quantity("m", ""), **place})
         draw_scene(name="demo", dense=capture / "dense.ply", georeference_json=about, objects=[], figure=figure)
         return (cv2.imread(str(figure)) < 40).all(2).sum()
 
     # A cloud whose file names no CRS has one that is null.
     assert drawn("EPSG:25832") > drawn(None) + 20
+    # South Africa's coordinates count to the west and to the south.
+    assert drawn("EPSG:2048") == drawn(None)
 
 
 def test_the_scene_s_sheet_shows_the_errors_of_cameras_in_their_colour(capture, tmp_path):
