@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from support.photographed_plane import photographs
 
 from scenefuse import command_line
-from scenefuse.cloud.clouds import Cloud, write_cloud
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.cloud.crs import crs_name
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3, look_at
@@ -219,6 +219,13 @@ def test_a_written_surface_is_read_as_it_was(closed, tmp_path: Path):
     assert np.array_equal(again.faces, closed.faces) and np.array_equal(again.classes, closed.classes)
     assert np.array_equal(again.vertices.points, closed.vertices.points)
     assert set(again.vertices.fields) == {"evidence", "deviation", "class"}
+
+
+def test_colours_of_an_exported_surface_are_read_as_they_were(closed, tmp_path: Path):
+    painted = replace(closed.vertices, colors=np.full((len(closed.vertices), 3), [200, 100, 5], np.uint8))
+    measured = np.full_like(closed.classes, FaceClass.MEASURED)
+    write_glb(tmp_path / "surface.glb", replace(closed, vertices=painted, classes=measured), {})
+    assert np.abs(read_cloud(tmp_path / "surface.glb").colors.astype(int) - [200, 100, 5]).max() <= 1
 
 
 def test_another_reader_finds_metres_with_y_up_and_the_classes_in_the_glb(closed, tmp_path: Path):

@@ -433,7 +433,7 @@ class _Gltf:
                 continue
             names, number = primitive["attributes"], primitive.get("material", -1)
             vertices = self.values(names["POSITION"])
-            colors = 255 * self.values(names["COLOR_0"])[:, :3] if "COLOR_0" in names else None
+            colors = self.colors(names["COLOR_0"]) if "COLOR_0" in names else None
             uvs = None
             if number >= 0 and (place := f"TEXCOORD_{self.texture(number).get('texCoord', 0)}") in names:
                 uvs = self.values(names[place])[faces]
@@ -481,6 +481,14 @@ class _Gltf:
             rows = self.stored(sparse["indices"], _kind(sparse["indices"]), sparse["count"], 1)[:, 0]
             table[rows] = self.stored(sparse["values"], kind, sparse["count"], width)
         return np.maximum(table / np.iinfo(kind).max, -1) if about.get("normalized") else table
+
+    def colors(self, accessor: int) -> Array:
+        """(N, 3) colours of vertices, 0..255. glTF's are linear (2.0, 3.9.2), as Blender writes them in 16 bits; what
+        trimesh and Open3D write as bytes and real numbers is as in pictures (IEC 61966-2-1)."""
+        shares = self.values(accessor)[:, :3]
+        if _kind(self.document["accessors"][accessor]) != np.uint16:
+            return 255 * shares
+        return 255 * np.where(shares <= 0.0031308, 12.92 * shares, 1.055 * shares ** (1 / 2.4) - 0.055)
 
     def stored(self, about: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> NDArray[Any]:
         """(N, K) numbers that lie in a buffer."""
