@@ -1,6 +1,7 @@
 """`scenefuse export`: what is handed over of finished objects, and one file with all of it."""
 
 import argparse
+import os
 import re
 import subprocess
 import sys
@@ -49,6 +50,10 @@ def export(arguments: list[str], settings_files: list[Path]) -> int:
         sys.exit(f"error: {which} here ({Path.cwd()}); run the workflow first (scenefuse run)")
     if words.zip and not REPORT.is_file():
         sys.exit(f"error: --zip needs {REPORT}, which is not here; run the workflow to its end first (scenefuse run)")
+    if words.zip and (words.zip.is_dir() or not os.access(words.zip.parent, os.W_OK)):
+        sys.exit(
+            f"error: {words.zip} cannot be written: it is a folder, or its own is missing or may not be written to"
+        )
     names = sorted(words.names or finished)
     if words.facade:
         if len(names) > 1:
@@ -71,7 +76,8 @@ def export(arguments: list[str], settings_files: list[Path]) -> int:
     ended = _renew_report(others) if REPORT.is_file() else 0
     if words.zip and not ended:
         try:
-            write_zip(REPORT, map(Path, targets), words.zip)
+            # Cameras belong to photos that are not sent.
+            write_zip(REPORT, [Path(t) for t in targets if not t.endswith("/cameras")], words.zip)
         except OSError as error:
             sys.exit(f"error: {error}")
         print(f"To send: {words.zip} ({words.zip.stat().st_size / 1e6:.0f} MB); unpacked, open its {REPORT.name}")
@@ -107,7 +113,7 @@ def _renew_report(others: list[str]) -> int:
 
 
 def write_zip(page: Path, exported: Iterable[Path], file: Path) -> None:
-    """Write a ZIP archive with the page at its top and, in their folders, what it links to, so that its links work.
+    """Write a ZIP archive with page and PDF at its top and, in folders, what the page links to, so that links work.
 
     Args:
         page: results/summary/report.html; its links to results begin with "../".
@@ -116,8 +122,14 @@ def write_zip(page: Path, exported: Iterable[Path], file: Path) -> None:
     """
     results, text = page.parent.parent, page.read_text(encoding="utf-8")
     given = {*exported, *(results / link for link in re.findall(r'href="\.\./([^"#]+)"', text))}
-    files = {path for top in given for path in ([top] if top.is_file() else top.rglob("*")) if path.is_file()}
+    files = {
+        path
+        for top in given
+        for path in ([top] if top.is_file() else top.rglob("*"))
+        if path.is_file() and path.name[0] != "."
+    }
     with atomic_file(file) as temporary, ZipFile(temporary, "w", ZIP_DEFLATED, compresslevel=1) as archive:
-        archive.writestr(page.name, text.replace('href="../', 'href="'))
+        archive.writestr(page.name, text.replace('href="../', 'href="').replace(">results/", ">"))
         for path in sorted(files):
-            archive.write(path, path.relative_to(results))
+            # What belongs to the summary lies at the top, beside the page.
+            archive.write(path, path.name if path.parent == page.parent else path.relative_to(results))

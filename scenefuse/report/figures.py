@@ -197,9 +197,10 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     cameras = {"from above, with the stations": from_above}
     shown_from, middle = join.stations[: len(SIDES_DEG) - 1], (join.framed.min(0) + join.framed.max(0)) / 2
     for number, place in enumerate(shown_from, 1):
-        x, y, z = place - middle
-        label = f"from station {number}, {np.linalg.norm([x, y, z]):.3g} {join.unit}"
+        x, y = (place - middle)[:2]
+        label = f"from station {number}, {np.hypot(x, y):.3g} {join.unit}"
         label += f" {compass(np.degrees(np.arctan2(x, y)))} of it" if join.has_north else " away"
+        label += f", {place[2] - join.framed[:, 2].min():.3g} {join.unit} up"
         cameras[label] = camera_at(place, join.framed, TILE_PX)
     for azimuth in SIDES_DEG[len(cameras) :]:
         cameras[_from(azimuth, join.has_north)] = orbit_camera(join.framed, azimuth, 20.0, TILE_PX)

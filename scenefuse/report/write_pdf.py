@@ -151,7 +151,10 @@ class _Page(FPDF):
         for k, (side, (pixels, pixel)) in enumerate(zip(SIDES, views)):
             x = self.l_margin + k % 2 * (cell + GAP_MM)
             y = top + k // 2 * (height * per_unit + 2 * GAP_MM)
-            self.image(Image.fromarray(pixels), x, y, pixels.shape[1] * pixel * per_unit)
+            high, wide = (side_px * pixel * per_unit for side_px in pixels.shape[:2])
+            self.set_fill_color(217)  # as on the drawings: a wall may be white
+            self.rect(x, y, wide, high, "F")
+            self.image(Image.fromarray(pixels), x, y, wide)
             self.text(x, y + height * per_unit + 3, f"from the {side}")
         bar = round_below(width / 2)
         self.set_y(top + 2 * (height * per_unit + 2 * GAP_MM) + 2)
@@ -160,4 +163,4 @@ class _Page(FPDF):
         self.ln(1)
         ratio = "" if unit == "scene units" else f"1:{scale} on A4; "
         north = "" if value(known, "has_north") else "; y taken for north"
-        self.cell(0, 5, f"{ratio}bar: {length(bar, unit)}; white: not measured{north}", new_x="LMARGIN", new_y="NEXT")
+        self.cell(0, 5, f"{ratio}bar: {length(bar, unit)}; grey: not measured{north}", new_x="LMARGIN", new_y="NEXT")

@@ -652,20 +652,24 @@ def test_a_zip_holds_the_page_and_what_it_links_to_so_that_links_work_where_it_i
     monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit, match="--zip needs results/summary/report.html, which is not here"):
         command_line.main()
-    links = '<a href="../objects/shed/fused.ply">a</a><a href="../gone.ply">b</a><a href="#shed">c</a>'
+    links = '<a href="../objects/shed/fused.ply">results/a</a><a href="../gone.ply">b</a><a href="#shed">c</a>'
     (results / "summary").mkdir()
     (results / "summary/report.html").write_text(links, encoding="utf-8")
+    (results / "summary/report.pdf").touch()
+    (results / "objects/shed/drawings/.timestamp").touch()
+    (tmp_path / "to").mkdir()
     monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit) as ended:
         command_line.main()
     assert ended.value.code == 0 and "To send: to/send.zip (0 MB)" in capsys.readouterr().out
     with zipfile.ZipFile("to/send.zip") as archive:
-        files = {"report.html", "objects/shed/fused.ply", "objects/shed/drawings/plan.png"}
+        files = {"report.html", "report.pdf", "objects/shed/fused.ply", "objects/shed/drawings/plan.png"}
         assert set(archive.namelist()) == files
-        assert 'href="objects/shed/fused.ply"' in archive.read("report.html").decode()
-    monkeypatch.setattr(sys, "argv", ["scenefuse", "export", "--zip", "to"])
-    with pytest.raises(SystemExit, match="error: .*to"):
-        command_line.main()
+        assert '<a href="objects/shed/fused.ply">a</a>' in archive.read("report.html").decode()
+    for bad in ("to", "nowhere/send.zip"):
+        monkeypatch.setattr(sys, "argv", ["scenefuse", "export", "--zip", bad])
+        with pytest.raises(SystemExit, match=f"error: {bad} cannot be written"):
+            command_line.main()
 
 
 def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_interpolated(closed, tmp_path: Path):
