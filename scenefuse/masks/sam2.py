@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -118,7 +119,7 @@ def _enlarged(logits: NDArray[np.float32], size: tuple[int, int]) -> list[Mask]:
     return [cv2.resize(m.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0 for m in logits]
 
 
-def segment(network: Sam2, target: Target, view: View, outline: Mask | None, clicks: PhotoClicks | None = None) -> Mask:
+def segment(network: Sam2, target: Target, view: View) -> Mask:
     """The object in one photo, prompted by all exact points, as this photo sees them, and the box around all.
 
     A point that the photo does not see is hidden by the object itself, so its pixel is the object's all the same. Where
@@ -128,13 +129,10 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None, cli
         network: SAM 2.
         target: points that span the object.
         view: the photo, with RGB pixels.
-        outline: (H, W) the visual hull of the other photos' masks; then the box is its own, and the mask most like it
-            is taken. The network does not see it: it would only give it back.
-        clicks: made in this photo, if any; they prompt it too.
 
     Returns:
-        (H, W), of the network's masks the one with most points in it and the best quality, or the most like the
-        outline; empty where no point is in the photo.
+        (H, W), of the network's masks the one with most points in it and the best quality; empty where no point is in
+        the photo.
     """
     size = (view.height, view.width)
     pixels, depth = view.project(target.spanning)
@@ -144,18 +142,40 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None, cli
         return np.zeros(size, dtype=bool)
     exact = inside.copy()
     exact[target.inexact] = False
-    spanned = pixels[front] if outline is None or not outline.any() else np.argwhere(outline)[:, ::-1] + 0.5
-    low, high = spanned.min(0), spanned.max(0)
-    grow = BOX_GROWTH_SHARE * (high - low).max()
-    box = np.clip(np.stack([low - grow, high + grow]), 0, size[::-1])
-    on, off = pixels[exact if exact.any() else inside], NO_PIXELS
-    if clicks is not None:
-        on, off, box = np.concatenate([clicks.on, on]), clicks.off, box if clicks.box is None else clicks.box
-    found, quality = network.masks(network.encode(view.pixels), size, on, box, off)
+    on = pixels[exact if exact.any() else inside]
+    found, quality = network.masks(network.encode(view.pixels), size, on, _box(pixels[front], size))
     u, v = on.astype(int).T
-    if outline is not None:
-        quality = np.array([mask_iou(m, outline) for m in found])
     return cleaned(found[int(np.argmax([m[v, u].mean() * q for m, q in zip(found, quality)]))], view.pixels)
+
+
+def segment_like(network: Sam2, target: Target, view: View, outline: Mask, clicks: PhotoClicks) -> Mask:
+    """The object in one photo once more, prompted by what other photos say: the box of their outline of it, and a few
+    of its points in the middle of that. The network does not see the outline: it would only give it back.
+
+    Args:
+        network: SAM 2.
+        target: the object's points.
+        view: the photo, with RGB pixels.
+        outline: (H, W) the visual hull of the other photos' masks, not empty.
+        clicks: made in this photo; they prompt it too.
+
+    Returns:
+        (H, W), of the network's masks the one most like the outline.
+    """
+    size, pixels = (view.height, view.width), view.visible(target.sparse[target.kind > 0])[1]
+    own = pixels[outline[pixels[:, 1], pixels[:, 0]]].astype(np.float64) + 0.5
+    on = np.concatenate([clicks.on, _middle(own)]) if len(own) else clicks.on
+    box = _box(np.argwhere(outline)[:, ::-1] + 0.5, size) if clicks.box is None else clicks.box
+    found, _ = network.masks(network.encode(view.pixels), size, on, box, clicks.off)
+    return cleaned(max(found, key=lambda mask: mask_iou(mask, outline)), view.pixels)
+
+
+def _box(pixels: NDArray[Any], size: tuple[int, int]) -> Array:
+    """(2, 2) corners of a box around (N, 2) pixels of a photo of (height, width), upper left first: points seldom mark
+    the ends."""
+    low, high = pixels.min(0), pixels.max(0)
+    grow = BOX_GROWTH_SHARE * (high - low).max()
+    return np.clip(np.stack([low - grow, high + grow]), 0, size[::-1])
 
 
 def query_sam2(network: Sam2, view: View, prompts: Prompts, box: Array | None) -> tuple[list[Mask], Array]:

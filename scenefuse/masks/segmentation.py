@@ -17,9 +17,10 @@ from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks, clicks_
 from scenefuse.marks.triangulation import marked_size, triangulate_consistent
 from scenefuse.masks.grabcut import along_edges, cleaned, first_cuts, query_grabcut, second_cuts
 from scenefuse.masks.prompts import BOX_GROWTH_SHARE, Measure, Segmenter, agreement
-from scenefuse.masks.propagation import propagate
-from scenefuse.masks.sam2 import SIDE_PX, Sam2, query_sam2, segment
+from scenefuse.masks.propagation import NO_CLICKS, propagate
+from scenefuse.masks.sam2 import SIDE_PX, Sam2, query_sam2, segment, segment_like
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
+from scenefuse.masks.votes import MIN_AGREEMENT, MIN_KNOWN_POINTS, points_held
 from scenefuse.mvs.stereo_points import with_stereo_points
 from scenefuse.photos.workspace import View, Workspace, read_model
 
@@ -89,7 +90,7 @@ def segment_by_grabcut(
 
 def segment_by_sam2(network: Sam2, target: Target, photos: Workspace, settings: MaskSettings) -> list[Mask]:
     """SAM 2 photo by photo, and once more, with the visual hull's box, where a mask disagrees with the hull."""
-    masks = [segment(network, target, view, None) for view in photos.views]
+    masks = [segment(network, target, view) for view in photos.views]
     return segment_again(network, target, masks, photos, settings)
 
 
@@ -100,18 +101,26 @@ def segment_again(
     photos: Workspace,
     settings: MaskSettings,
     clicked: Mapping[int, PhotoClicks] = NOTHING,
+    votes: NDArray[np.int8] | None = None,
 ) -> list[Mask]:
-    """SAM 2 once more, with the visual hull's box and the photo's own clicks, where one of the masks (H, W) disagrees
-    with the hull, or much more than most, unless clicks alone suffice for it; then all at the photo's resolution."""
+    """SAM 2 once more, by what the other photos say and the photo's own clicks, where one of the masks (H, W) disagrees
+    with the hull, or much more than most, unless clicks alone suffice for it; then all at the photo's resolution.
+
+    A mask that holds points of something else, by the `votes` (P,) of the first masks, as of a tree before a wall, is
+    not taken.
+    """
     masks = list(masks)
     hull = carve_consistent(target, photos.views, masks, settings, MAX_WRONG_SHARE)
     outlines = [silhouette(hull, view) for view in photos.views]
     agreement = [mask_iou(mask, outline) for mask, outline in zip(masks, outlines)]
     least = max(settings.min_agreement, MIN_SHARE_OF_MEDIAN * float(np.median(agreement)))
     for k, (view, outline) in enumerate(zip(photos.views, outlines)):
-        if agreement[k] < least and not (masks[k].any() and k in clicked and clicked[k].enough):
-            again = segment(network, target, view, outline, clicked.get(k))
-            if mask_iou(again, outline) > agreement[k]:
+        final = masks[k].any() and k in clicked and clicked[k].enough
+        if outline.any() and agreement[k] < least and not final:
+            again = segment_like(network, target, view, outline, clicked.get(k, NO_CLICKS))
+            held = np.zeros(0) if votes is None else votes[points_held(photos, k, again)]
+            foreign = np.count_nonzero(held) >= MIN_KNOWN_POINTS and np.mean(held[held != 0] > 0) < MIN_AGREEMENT
+            if mask_iou(again, outline) > agreement[k] and not foreign:
                 masks[k] = again
             print(f"{view.name} segmented again, IoU {mask_iou(masks[k], outline):.2f}", flush=True)
     return [_at_full_size(view, mask) for view, mask in zip(photos.views, masks)]
@@ -235,7 +244,7 @@ def masks_from_prompts(
         found = propagate(segment, photos, own, settings.max_click_residual_px, measure)
         target = target_from_votes(found.kind, photos, up, seed)
         if network:
-            masks = segment_again(network, target, found.masks, photos, settings, found.clicked)
+            masks = segment_again(network, target, found.masks, photos, settings, found.clicked, found.kind)
         else:
             masks = segment_by_grabcut(target, photos, settings, found.clicked)
         names = tuple(photos.views[k].name for k, clicks in found.clicked.items() if clicks.enough)

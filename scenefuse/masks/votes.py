@@ -78,6 +78,12 @@ def _denied(photos: Workspace, k: int, mask: Mask, clicks: PhotoClicks) -> list[
     return denied
 
 
+def points_held(photos: Workspace, k: int, mask: Mask) -> NDArray[np.int64]:
+    """Rows of the points that a photo sees in a mask (H, W) of it."""
+    u, v = pixel_of(photos.seen_at[k], mask)
+    return photos.seen[k][mask[v, u]]
+
+
 def vote_shares(photos: Workspace, made: dict[int, Voter]) -> Array:
     """(P,) share of the votes that are for the object, per sparse point, weighted by quality; NaN without votes."""
     votes, total = np.zeros(len(photos.points)), np.zeros(len(photos.points))

@@ -450,8 +450,17 @@ def test_clicks_and_box_prompt_their_own_photo_again_with_sam2(photos):
     told = {8: clicks([MIDDLE], [(100.0, 80.0)], [[30, 15], [90, 75]]), 3: clicks([MIDDLE])}
     segment_again(network, of_points(photos), masks, photos, COARSE, told)
     ((name, inside, box, outside),) = network.prompts
-    assert name == "f08.png" and inside[0].tolist() == list(MIDDLE) and len(inside) > 10
+    assert name == "f08.png" and inside[0].tolist() == list(MIDDLE) and len(inside) == 5
     assert outside.tolist() == [[100, 80]] and box.tolist() == [[30, 15], [90, 75]]
+
+
+def test_a_mask_made_again_is_not_taken_where_it_holds_what_other_masks_leave_out(photos):
+    masks = [true_mask(view) for view in photos.views]
+    masks[8] = np.zeros_like(masks[8])
+    for vote, taken in ((1, True), (-1, False), (0, True)):
+        votes = np.full(len(photos.points), vote, np.int8)
+        again = segment_again(BallNetwork(photos), of_points(photos), masks, photos, COARSE, votes=votes)
+        assert again[8].any() == taken
 
 
 def test_a_part_with_the_background_s_colour_is_found_from_a_click_by_the_edge_around_it():

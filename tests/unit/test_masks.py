@@ -16,12 +16,13 @@ import pytest
 from scenefuse.core.stage import StageError, read_json, sha256, value, write_json
 from scenefuse.geometry.visual_hull import carve, mask_iou, silhouette
 from scenefuse.marks.clicks import read_points
+from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.marks.triangulation import marked_size
 from scenefuse.masks import make_masks as masks_module
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.grabcut import cleaned, second_trimap, stamp
 from scenefuse.masks.make_masks import MaskInputs, make_masks
-from scenefuse.masks.sam2 import check_weights, segment
+from scenefuse.masks.sam2 import check_weights, segment, segment_like
 from scenefuse.masks.sam2_weights import (
     DECODER,
     ENCODER,
@@ -298,7 +299,7 @@ class TrueNetwork:
         self.segmented.append(k)
         return k
 
-    def masks(self, k, size, points_px, box, outside_px):
+    def masks(self, k, size, points_px, box, outside_px=None):
         ball = look(camera_pose(k))[0]
         assert size == ball.shape
         assert cv2.dilate(ball.astype(np.uint8), np.ones((5, 5)))[tuple(points_px.astype(int).T[::-1])].all()
@@ -418,7 +419,7 @@ def test_points_that_are_not_exact_give_the_box_but_no_prompt(capture, monkeypat
         def encode(self, image):
             return None
 
-        def masks(self, image, size, points_px, box, outside_px):
+        def masks(self, image, size, points_px, box):
             asked.append((points_px, box))
             return [np.ones(size, dtype=bool)] * 3, np.ones(3)
 
@@ -426,9 +427,38 @@ def test_points_that_are_not_exact_give_the_box_but_no_prompt(capture, monkeypat
     target = target_from_points(np.array(list(MARKS.values()), float), photos, np.array([0, 0, 1.0]), 0)
     photo = photos.rgb(photos.views[0])
     for inexact in ([], [0, 1], list(range(6))):
-        segment(Network(), dataclasses.replace(target, inexact=np.array(inexact, int)), photo, None)
+        segment(Network(), dataclasses.replace(target, inexact=np.array(inexact, int)), photo)
     assert [len(points) for points, _ in asked] == [6, 4, 6]
     assert all((box == asked[0][1]).all() for _, box in asked)
+
+
+def test_a_mask_is_made_again_from_the_box_of_its_outline_and_a_few_points_in_its_middle(capture):
+    asked, outline = [], np.zeros((HEIGHT, WIDTH), dtype=bool)
+
+    class Network:
+        def encode(self, image):
+            return None
+
+        def masks(self, image, size, points_px, box, outside_px):
+            asked.append((points_px, box, outside_px))
+            larger = cv2.dilate(outline.astype(np.uint8), np.ones((9, 9))) > 0
+            return [np.ones(size, dtype=bool), larger, np.zeros(size, dtype=bool)], np.array([0.9, 0.1, 0.8])
+
+    photos = read_workspace(capture / "undistorted")
+    target = target_from_points(np.array(list(MARKS.values()), float), photos, np.array([0, 0, 1.0]), 0)
+    photo = photos.rgb(photos.views[0])
+    own = photo.visible(target.sparse[target.kind > 0])[1]
+    low, high = own.min(0), own.max(0) + 1
+    outline[low[1] : high[1], low[0] : high[0]] = True
+    click = PhotoClicks(np.array([[5.0, 7.0]]), np.array([False]))
+    mask = segment_like(Network(), target, photo, outline, click)
+    (on, box, off), grow = asked[0], 0.05 * (high - low - 1).max()
+    assert 1 < len(on) <= 4 and (on >= low).all() and (on <= high).all() and np.array_equal(off, click.pixels)
+    assert np.allclose(box, np.clip([low + 0.5 - grow, high - 0.5 + grow], 0, (WIDTH, HEIGHT)))
+    assert outline.sum() <= mask.sum() < 2 * outline.sum() + 2000  # most like the outline, whatever its quality
+    # Where no point of the object is known, its own clicks and the box prompt it.
+    segment_like(Network(), dataclasses.replace(target, kind=np.zeros_like(target.kind)), photo, outline, click)
+    assert len(asked[1][0]) == 0
 
 
 def test_wrong_or_missing_weights_are_named(tmp_path):
