@@ -69,7 +69,7 @@ def textured(surface: Surface, photos: list[View], read: Callable[[int], NDArray
     wanted = 2 * small.areas()[painted].sum() * np.median(pixels[pixels > 0])
     side = int(np.clip(np.sqrt(wanted), 64, MAX_SIDE_PX))
     uv = unfolded(points, faces, side)
-    face, weights, places = _texels(points, faces, uv, side)
+    face, weights, places = texels_of_faces(points, faces, uv, side)
     of_face, of_vertex = best_worth(worth[:, painted]), vertex_worth(worth[:, painted], faces, len(points))
     color, weight = np.zeros((len(face), 3)), np.zeros(len(face))
     for number, view in enumerate(photos):
@@ -218,7 +218,7 @@ def vertex_worth(worth: Array, faces: Rows, count: int) -> Array:
     return best_worth(np.where(np.isfinite(least), least, 0.0))
 
 
-def _texels(points: Array, faces: Rows, uv: Array, side: int) -> tuple[Rows, Array, Array]:
+def texels_of_faces(points: Array, faces: Rows, uv: Array, side: int) -> tuple[Rows, Array, Array]:
     """(T, 3) column and row of the texels on faces, and which face; (T, 3) weights of its corners, and the places
     (T, 3) that they show."""
     flat = np.column_stack([uv.reshape(-1, 2) * side, np.zeros(3 * len(faces))])

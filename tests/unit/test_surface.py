@@ -403,9 +403,9 @@ def test_texels_of_many_pixels_are_found_strip_by_strip_like_those_of_few(monkey
         np.array([[0.1, 0.1, 0], [0.9, 0.1, 0], [0.9, 0.8, 1], [0.1, 0.8, 1]]),
         np.array([[0, 1, 2], [0, 2, 3]]),
     )
-    whole = texture._texels(square, faces, square[faces][..., :2], 100)
+    whole = texture.texels_of_faces(square, faces, square[faces][..., :2], 100)
     monkeypatch.setattr(texture, "AT_ONCE", 700)
-    for a, b in zip(whole, texture._texels(square, faces, square[faces][..., :2], 100)):
+    for a, b in zip(whole, texture.texels_of_faces(square, faces, square[faces][..., :2], 100)):
         np.testing.assert_array_equal(a, b)
 
 
