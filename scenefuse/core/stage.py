@@ -113,6 +113,9 @@ def _of_files(error: OSError) -> str:
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR) and error.filename is not None:
         why = (error.strerror or "not allowed").lower()
         return f"{path}: {why}; check the folder and who may write there"
+    if error.errno == errno.ENAMETOOLONG:
+        # Of a photo, the names of its folders are part of its copy's.
+        return f"the name {Path(error.filename or '').name} is too long; shorten it, or the names of folders in it"
     return ""
 
 

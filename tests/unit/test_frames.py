@@ -1,4 +1,6 @@
+import signal
 import struct
+import sys
 
 import cv2
 import numpy as np
@@ -6,7 +8,7 @@ import pytest
 from PIL import Image
 from support.user_project import film
 
-from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.core.stage import StageError, read_json, run, value
 from scenefuse.photos.frames import (
     FrameSettings,
     VideoSettings,
@@ -89,6 +91,19 @@ def test_any_name_of_a_photo_serves(tmp_path):
     for index, name in enumerate(names):
         Image.fromarray(picture(seed=9 + index)).save(folder / name)
     assert {p.name for p in extract(tmp_path, folder)[0]} == {"00.png", "01.png", *names}
+
+
+def test_a_photo_whose_folders_make_its_name_too_long_is_named(tmp_path, monkeypatch, capsys):
+    names = ["a church in summer " * 5, "its western portal " * 5, "the figures above it " * 5]
+    folder = tmp_path.joinpath("photos", *names)
+    folder.mkdir(parents=True)
+    Image.fromarray(picture()).save(folder / "1.png")
+    monkeypatch.setattr(sys, "argv", ["extract_frames"])
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    with pytest.raises(SystemExit):
+        run(lambda: extract(tmp_path, tmp_path / "photos"))
+    said = capsys.readouterr().err
+    assert said.startswith("error: the name a church in") and "_1.png is too long; shorten it, or" in said
 
 
 def test_step_and_limit(tmp_path):
