@@ -155,7 +155,8 @@ def distinct_photos(folder: Path) -> tuple[list[str], list[str]]:
     by_size, first_of = dict[int, list[str]](), dict[str, str]()
     for name in sorted(names, key=lambda name: (len(name), name)):
         by_size.setdefault((folder / name).stat().st_size, []).append(name)
-    for alike in (group for group in by_size.values() if len(group) > 1):
+    # Empty files are no copies: each is to be named.
+    for alike in (group for size, group in by_size.items() if size and len(group) > 1):
         kept = dict[str, str]()
         for name in alike:
             first = kept.setdefault(sha256(folder / name), name)

@@ -70,6 +70,14 @@ def test_all_bad_photos_are_named_at_once(tmp_path, kind):
         listed(tmp_path, tmp_path / "p")
 
 
+def test_all_empty_photos_are_named_at_once(tmp_path):
+    save(tmp_path / "p" / "a.jpg")
+    for name in ("b.jpg", "c.jpg"):
+        (tmp_path / "p" / name).touch()
+    with pytest.raises(StageError, match=r"b.jpg cannot be decoded .*; nor can c.jpg$"):
+        listed(tmp_path, tmp_path / "p")
+
+
 def test_copies_and_rotations_are_noted(tmp_path):
     save(tmp_path / "p" / "a.jpg")
     save(tmp_path / "p" / "b.jpg")
