@@ -108,6 +108,7 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     _write_geojson(outputs.geojson, rows)
     content = _report(missing, plan) | {
         "ground_missing": quantity(missing_ground(obj, near, photos), "of the ground beside it that photos show"),
+        "cell": quantity(missing.side, unit),
         "of": quantity("its surface" if masks else "what its own cloud holds", ""),
     }
     write_json(outputs.report, content)

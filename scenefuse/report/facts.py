@@ -59,7 +59,8 @@ def object_facts(row: Row) -> dict[str, str]:
         lacks = {what: has.get(f"surface_{name}", 0.0) for name, what in WORDS["missing"].items()}
         there, missing, *kinds = percents(list(lacks.values()))
         causes = ", ".join(f"{share} {what}" for what, share in zip(lacks, kinds) if share)
-        facts["Surface"] = f"{there} is there" + (f", {missing} is missing: {causes}" if missing else "")
+        cells = f" (in cells of {length(has['surface_cell'], unit)})" if "surface_cell" in has else ""
+        facts["Surface"] = f"{there} is there{cells}" + (f", {missing} is missing: {causes}" if missing else "")
         if has.get("ground_missing"):
             facts["Surface"] += f"; of the ground at its foot {percent(has['ground_missing'])} is missing"
     if found := accuracies(row):

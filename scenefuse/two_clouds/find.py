@@ -1,6 +1,7 @@
 """Registration of two clouds in memory: a decision and a transform, by the steps of the workflow."""
 
 import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -204,6 +205,7 @@ def find_in_scene(
     scales: ScaleRange | None = None,
     unit: str = "scene units",
     marked: bool = False,
+    progress: Callable[[str], None] = lambda line: None,
 ) -> tuple[Registration, Cloud, list[tuple[float, Array]]]:
     """Find where an object lies in a scene that may be thirty times as wide (method R16).
 
@@ -223,6 +225,7 @@ def find_in_scene(
         scales: scene units per object unit; None to estimate them from both extents.
         unit: what the scene's lengths are counted in, for the report.
         marked: the points are those around fiducials: no parts of it are tried.
+        progress: called with a line before each step that takes long.
 
     Returns:
         The best registration, the part of the scene that it was found in, and the places where it was tried, the best
@@ -231,22 +234,30 @@ def find_in_scene(
     Raises:
         StageError: too few different points, or all in one place or along one line, on either side.
     """
+    progress("searching all of it")
     searched = [(search(obj, scene, settings, seed, ups, scales), scene)]
-    for rows in [] if marked else likely_places(obj, scene, up_in_scene, settings.crop, seed, MAX_PLACES):
+    likely = [] if marked else likely_places(obj, scene, up_in_scene, settings.crop, seed, MAX_PLACES)
+    for number, rows in enumerate(likely, 1):
+        progress(f"searching part {number} of {len(likely)} that look like the object")
         with contextlib.suppress(StageError):  # too few different points there
             searched.append((search(obj, scene[rows], settings, seed, ups, scales), scene[rows]))
     # The refinement of a pose does not catch up with one that is twice as good.
     least = max(there.total for there, _ in searched) / 2
     best = sorted((one for one in searched if one[0].total >= least), key=lambda one: -one[0].total)
-    tried = [(refined(there, settings, unit), part) for there, part in best[: settings.coarse.keep]]
+    tried = list[tuple[Registration, Cloud]]()
+    kept = best[: settings.coarse.keep]
+    for number, (there, part) in enumerate(kept, 1):
+        progress(f"refining the poses found: place {number} of {len(kept)}")
+        tried.append((refined(there, settings, unit), part))
     found, part = max(tried, key=lambda one: (one[0].registered, one[0].total))
     if len(tried) > 1:
         found = _unless_elsewhere(found, [other for other, _ in tried], obj, settings.fine)
     inward = None if obj.normals is None else ((obj.points - obj.points.mean(0)) * obj.normals).sum(1) < 0
     if not found.registered and inward is not None and inward.mean() > 0.5:
+        progress("most normals of the object face inwards: again, with their sides estimated")
         other, where, places = find_in_scene(
             replace(obj, normals=None), scene, settings, seed,
-            ups=ups, up_in_scene=up_in_scene, scales=scales, unit=unit, marked=marked,
+            ups=ups, up_in_scene=up_in_scene, scales=scales, unit=unit, marked=marked, progress=progress,
         )  # fmt: skip
         if other.registered:
             return replace(other, sides_estimated=True), where, places

@@ -2,6 +2,7 @@
 
 import os
 import shlex
+import sys
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
@@ -123,7 +124,7 @@ def register(
     whole = given.scene.part
     found, part, places = find_in_scene(
         given.object, whole, settings, seed,
-        ups=given.ups, up_in_scene=known.ups()[1], scales=scales, unit=unit, marked=marked,
+        ups=given.ups, up_in_scene=known.ups()[1], scales=scales, unit=unit, marked=marked, progress=_progress,
     )  # fmt: skip
     if found.sides_estimated:
         notes.append(f"most normals of {object} face inwards: it is found with their sides estimated from the points")
@@ -142,6 +143,8 @@ def register(
     }
     if not found.registered:
         advice = f"draw a box around the object in {out / BOX_PAGE}, which gives the next command"
+        if len(given.object) > given.scene.summary.count:
+            advice = f"{object} has more points than {scene}: if it is the scene, exchange the two; otherwise {advice}"
         content["next"] = quantity(f"{advice}; {ROOT}/docs/register.md lists causes", "")
         content["places"] = quantity([{"score": score, "crop_box": box.ravel()} for score, box in places], unit)
     print("\n".join(summary(found, given.searched, given.ups)), flush=True)
@@ -161,6 +164,11 @@ def register(
     write_json(written[0], content)
     print(f"written    {', '.join(map(str, written))}", flush=True)
     return ExitStatus.REGISTERED if found.registered else ExitStatus.UNREGISTERED
+
+
+def _progress(step: str) -> None:
+    """One line a step on stderr, for who waits minutes for the result on stdout."""
+    print(f"step       {step}", file=sys.stderr, flush=True)
 
 
 def _command(

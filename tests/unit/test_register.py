@@ -61,7 +61,10 @@ def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, 
     assert las_crs(out / "object_in_scene.laz").to_epsg() == 32632
     assert (content["scale"]["unit"], content["agreement"]["tau"]["unit"]) == ("m per object unit", "m")
     assert (out / "picture.png").stat().st_size > 1000
-    printed = capsys.readouterr().out.strip().splitlines()
+    captured = capsys.readouterr()
+    steps = captured.err.splitlines()
+    assert "searching all of it" in steps[0] and "refining" in steps[-1]
+    printed = captured.out.strip().splitlines()
     assert len(printed) == 6 and printed[0].startswith("registered: ") and "whole scene" in printed[3]
 
 
@@ -123,6 +126,8 @@ def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_pa
     assert done.returncode == 3, done.stderr
     assert done.stdout.startswith("unregistered: ")
     assert "draw a box around the object in out/crop_box.html" in done.stdout
+    exchanged = "house.ply has more points than scene.ply: if it is the scene, exchange the two" in done.stdout
+    assert exchanged == (len(house.object) > len(other))
     content = read_json(out / "transform.json")
     assert value(content, "status") == "unregistered" and value(content, "reason") in done.stdout
     assert sorted(p.name for p in out.iterdir()) == ["crop_box.html", "picture.png", "transform.json"]

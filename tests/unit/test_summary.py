@@ -456,7 +456,7 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
     write_json(results / "objects/house/metrics.json", metrics)
     shares = {"missing": 0.018, "never_seen": 0.01, "untextured": 0.0, "contradicted": 0.008, "ground_missing": 0.012}
     found = {name: quantity(share, "1") for name, share in shares.items()}
-    found |= {"stations": quantity(3, ""), "stations_show": quantity(0.77, "1")}
+    found |= {"stations": quantity(3, ""), "stations_show": quantity(0.77, "1"), "cell": quantity(0.0521, "m")}
     write_json(results / "objects/house/missing.json", found)
     page = report(results)
     text = (results / "summary/summary.txt").read_text()
@@ -468,7 +468,7 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
     card = re.sub("<.+?>", "", card).replace("\u00a0", " ")
     for sentence in (
         "11.4 m × 9.96 m, 8.10 m high, overall",
-        "98.2 % is there, 1.8 % is missing: 1.0 % seen by no photo, 0.8 % where photos disagree;"
+        "98.2 % is there (in cells of 52.1 mm), 1.8 % is missing: 1.0 % seen by no photo, 0.8 % where photos disagree;"
         " of the ground at its foot 1.2 % is missing",
         "13.1 mm in the scene, the standard deviation of a point (two points in three are nearer)",
         "Photograph it from 3 places (results/objects/house/next_photos.csv): this would show 77 % of what no photo",
