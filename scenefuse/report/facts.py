@@ -74,7 +74,7 @@ def object_facts(row: Row) -> dict[str, str]:
         facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used, {taken}"
     folder = f"results/objects/{has['object']}"
     if "added_points" in has:
-        facts["File"] = f"{folder}/fused.ply with its surroundings (local frame, {_plural(unit)})"
+        facts["File"] = f"{folder}/fused.ply with its surroundings (local frame, {_plural(unit)}; for CloudCompare)"
     elif status == ALONE:
         facts["File"] = f"{folder}/object.ply (a frame of its own, {_plural(unit)})"
     return _capital(facts | _next(has))
@@ -140,12 +140,13 @@ def surface_facts(folder: Path, row: Row) -> dict[str, str]:
     place, has = f"results/objects/{folder.name}", _known(row)
     unit = _plural(has.get("unit", "m"))
     of_glb = unit if unit == "scene units" else "metres"
-    mesh = f"{place}/surface.ply (local frame, {unit}), {place}/surface.glb (the same, {of_glb}, y up)"
+    mesh = f"{place}/surface.ply (local frame, {unit}; for CloudCompare, MeshLab)"
+    mesh += f", {place}/surface.glb (the same, {of_glb}, y up; for Blender, web viewers)"
     if bridged := value(found, "bridged_area"):
         mesh += f"; {length(bridged, found['bridged_area']['unit'].replace('2', '²'))} of it {WORDS['bridged']}"
     if not is_current(folder / "drawings/drawings.pdf", folder / "surface.json"):
         return {"Mesh": mesh}
-    above = f"; above.tif beside it is in {has['crs']}" if "crs" in has else ""
+    above = f"; above.tif beside it, for QGIS, is in {has['crs']}" if "crs" in has else ""
     return {"Mesh": mesh, "Drawings": f"{place}/drawings/drawings.pdf, to scale{above}"}
 
 
@@ -213,13 +214,15 @@ def scene_facts(row: Row) -> dict[str, str]:
         facts["Local frame"] = f"metres east, north and up from {place}{above}"
     if found := accuracies(row):
         facts["Position"] = f"absolute, where on Earth the scene lies: {found[0]}"
+        if not {"check_rms_horizontal_m", "control_rms_horizontal_m"} & has.keys():
+            facts["Position"] += f"; {WORDS['common']}"
     if "length_unit" in has:
         facts["Scale"] = _scale(has)
     if "ground_pixel" in has:
         facts["Ground pixel"] = f"{length(has['ground_pixel'], unit)}, what a pixel of a photo covers on the ground"
     if "completed_points" in has:
         file = f"results/scenes/{has['scene']}/completed"
-        facts["File"] = f"{file}.copc.laz" + (
+        facts["File"] = f"{file}.copc.laz (for QGIS, CloudCompare)" + (
             f" in these coordinates; {file}.ply in the local frame" if "crs" in has else f", {file}.ply"
         )
     return _capital(facts)

@@ -212,7 +212,7 @@ def test_the_text_says_what_psnr_was_measured_on_and_what_the_completed_scene_ho
     write_json(results / "scenes/demo/completed.json", completed)
     counts = " ".join((summarise(results, ["house", "balloon"]) / "summary.txt").read_text().split())
     assert "5,030 points: 5,000 of the scene before, of which 20 are removed or replaced by better ones" in counts
-    assert "results/scenes/demo/completed.copc.laz, results/scenes/demo/completed.ply" in text
+    assert "results/scenes/demo/completed.copc.laz (for QGIS, CloudCompare), results/scenes/demo/completed.ply" in text
     assert "completed.copc" not in (summarise(results) / "details.txt").read_text()
 
 
@@ -507,6 +507,11 @@ def test_the_scene_says_where_when_and_how_exactly_it_was_photographed(results):
     # Of normal errors, 90 % stay below 1.517 RMS in the plane and 1.645 RMS upwards.
     assert "Absolute, where on Earth the scene lies: check points are 20.0 mm horizontally and 40.0 mm" in text
     assert "nine of ten less than 30.3 mm (CE90) and 65.8 mm (LE90)" in text
+    assert "common to all photos" not in text
+    gps = {f"gps_residual_{way}_rms_m": quantity(0.5, "m") for way in ("horizontal", "vertical")}
+    write_json(scene / "georeference.json", {k: v for k, v in here.items() if "check" not in k} | gps)
+    text = " ".join((summarise(results) / "details.txt").read_text().split())
+    assert "an error common to all photos, metres without RTK or PPK, does not show in these" in text
 
 
 def test_a_run_ends_in_three_lines(results):
