@@ -56,9 +56,8 @@ def object_facts(row: Row) -> dict[str, str]:
         sides = " × ".join(length(has[side], unit) for side in ("length", "width")).replace(" scene units ×", " ×")
         facts["Size"] = f"{sides}, {length(has['height'], unit)} high, overall"
     if "surface_missing" in has:
-        lacks = {what: has.get(f"surface_{name}", 0.0) for name, what in WORDS["missing"].items()}
-        there, missing, *kinds = percents(list(lacks.values()))
-        causes = ", ".join(f"{share} {what}" for what, share in zip(lacks, kinds) if share)
+        there, missing, *kinds = _surface(has)
+        causes = ", ".join(f"{share} {what}" for what, share in zip(WORDS["missing"].values(), kinds) if share)
         cells = f" (in cells of {length(has['surface_cell'], unit)})" if "surface_cell" in has else ""
         facts["Surface"] = f"{there} is there{cells}" + (f", {missing} is missing: {causes}" if missing else "")
         if has.get("ground_missing"):
@@ -89,7 +88,12 @@ def verdict(row: Row) -> str:
 def _completed(has: dict[str, Any]) -> str:
     """How much of an object's surface is there, to follow the word "completed"."""
     known = has["status"] == "registered" and "surface_missing" in has
-    return f" to {percent(1 - has['surface_missing'])}" if known else ""
+    return f" to {_surface(has)[0]}" if known else ""
+
+
+def _surface(has: dict[str, Any]) -> list[str]:
+    """The shares of an object's surface that are there, missing, and missing for each reason; they sum up."""
+    return percents([has.get(f"surface_{name}", 0.0) for name in WORDS["missing"]])
 
 
 def scale_sd(row: Row) -> float:

@@ -633,6 +633,12 @@ def test_what_is_completed_in_part_alone_is_not_called_completed():
     assert object_facts(row)["Result"] == "Found in the scene and completed to 8.7 %"
 
 
+def test_the_result_and_the_surface_of_an_object_name_the_same_share():
+    row = {"object": "house", "status": "registered", "surface_missing": 0.01152, "surface_never_seen": 0.00907}
+    facts = object_facts(row | {"surface_contradicted": 0.00245})
+    assert facts["Result"].endswith("completed to 98.9 %") and facts["Surface"].startswith("98.9 % is there")
+
+
 def test_a_project_is_called_by_its_folder_and_its_objects(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert title_of([tmp_path / "house", tmp_path / "shed"]) == f"{tmp_path.name}: house, shed"

@@ -677,7 +677,10 @@ def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_int
     (tmp_path / "fused.ply").touch()
     write_json(tmp_path / "surface.json", surface_report(closed, "m") | {"reason": quantity("", "")})
     found = surface_facts(tmp_path, {})["Mesh"]
-    assert f"objects/{tmp_path.name}/surface.ply (local frame, metres)" in found and "%" not in found
+    assert (
+        f"objects/{tmp_path.name}/surface.ply (local frame, metres; for CloudCompare, MeshLab)" in found
+        and "%" not in found
+    )
     assert "surface.glb (the same, metres, y up; for Blender, web viewers)" in found
     assert f"; {value(surface_report(closed, 'm'), 'bridged_area'):#.3g} m² of it are interpolated" in found
     write_json(tmp_path / "surface.json", surface_report(closed, "m") | {"bridged_area": quantity(153.2, "m2")})
