@@ -172,7 +172,10 @@ def _stood_upright(folder: Path, photo: Photo, output: Path, bits: int) -> Photo
     target = output / photo.name
     target.parent.mkdir(parents=True, exist_ok=True)
     if stays(folder, photo, bits):
-        target.symlink_to(os.path.relpath(os.path.realpath(folder / photo.name), os.path.realpath(target.parent)))
+        # As the table names the folder: links outlast a move of the project alone, or of both.
+        original = os.path.realpath(folder / photo.name)
+        absolute = folder.is_absolute()
+        target.symlink_to(original if absolute else os.path.relpath(original, os.path.realpath(target.parent)))
         return photo
     return save_upright(folder, photo, target, bits)
 

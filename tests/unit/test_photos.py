@@ -4,6 +4,7 @@ import resource
 import struct
 import zlib
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -105,6 +106,16 @@ def test_rotated_photos_are_stood_upright_and_the_others_linked(tmp_path):
     with Image.open(tmp_path / "upright/sub/b.jpg") as seen:
         assert seen.getpixel((24, 8))[0] > 200 and seen.getpixel((8, 8))[0] < 50
     assert value(read_json(tmp_path / "photos.json"), "turned") == {"sub/b.jpg": 6}
+
+
+@pytest.mark.parametrize("place", ["photos", "project/photos"])
+def test_a_project_that_is_moved_finds_its_photos_as_its_table_does(tmp_path, monkeypatch, place):
+    save(tmp_path / place / "a.jpg")
+    monkeypatch.chdir(tmp_path)
+    listed(Path("project"), Path(place) if place.startswith("project") else tmp_path / place)
+    (tmp_path / "much/deeper").mkdir(parents=True)
+    moved = Path("project").rename("much/deeper/project")
+    assert (moved / "upright/a.jpg").is_symlink() and (moved / "upright/a.jpg").is_file()
 
 
 def test_a_photo_that_was_replaced_or_removed_since_it_was_listed_is_named(tmp_path):
