@@ -11,7 +11,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 
-from scenefuse.core.project import read_project
+from scenefuse.core.project import Project, read_project
 from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.transforms import along_a_line
@@ -24,7 +24,7 @@ EXPORTS = {
     "pdf": "results/summary/report.pdf",
 }
 RULES = ("make_surface", "draw_surface", "export_cameras", "make_tiles", "write_pdf")
-REPORT = Path("results/summary/report.html")
+REPORT, SUMMARY = Path("results/summary/report.html"), Path("results/summary/summary.txt")
 RUN = (sys.executable, "-m", "scenefuse", "run")
 
 
@@ -40,23 +40,15 @@ def export(arguments: list[str], settings_files: list[Path]) -> int:
         project = read_project(read_settings(*settings_files))
     except StageError as error:
         sys.exit(f"error: {error}")
-    # Results of rows that were removed or renamed stay.
-    finished, missing = (
-        [name for name in names if Path(f"results/objects/{name}/fused.ply").is_file() == there]
-        for names, there in ((project.objects, True), (words.names or (), False))
-    )
-    if missing or not finished:
-        which = f"results/objects/{missing[0]}/fused.ply is not" if missing else "no results/objects/NAME/fused.ply is"
-        sys.exit(f"error: {which} here ({Path.cwd()}); run the workflow first (scenefuse run)")
+    names = _added(words.names, project)
     if words.zip and not REPORT.is_file():
         sys.exit(f"error: --zip needs {REPORT}, which is not here; run the workflow to its end first (scenefuse run)")
     if words.zip and (words.zip.is_dir() or not os.access(words.zip.parent, os.W_OK)):
         sys.exit(
             f"error: {words.zip} cannot be written: it is a folder, or its own is missing or may not be written to"
         )
-    names = sorted(words.names or finished)
     if words.facade:
-        if len(names) > 1:
+        if len(names) != 1:
             sys.exit("error: --facade is of one object; name it by --object")
         # Once they are kept, every export draws them.
         if along_a_line(np.reshape(words.facade, (3, 3))):
@@ -66,8 +58,11 @@ def export(arguments: list[str], settings_files: list[Path]) -> int:
     # Given clouds have no cameras, and a scene that was not completed has no tiles.
     needed = {"cameras": "results/*/*/undistorted", "tiles": "results/scenes/*/completed.ply", "pdf": str(REPORT)}
     what = [item for item in words.what if any(Path().glob(needed.get(item, "*")))]
+    what, names = [item for item in what if names or "{object}" not in EXPORTS[item]], names or [""]
     targets = {EXPORTS[item].format(object=name, scene=scene) for item in what for name in names for scene in scenes}
     targets = {t for t in targets if not t.endswith("/tiles") or Path(t).with_name("completed.ply").is_file()}
+    if not targets:
+        sys.exit(f"error: there is nothing to export as {', '.join(words.what)}; {SUMMARY} says what the run made")
     ended = subprocess.run([*RUN, *sorted(targets), *others, "--allowed-rules", *RULES]).returncode
     if ended or {"-n", "--dry-run", "--dryrun"} & set(others):
         return ended
@@ -82,6 +77,26 @@ def export(arguments: list[str], settings_files: list[Path]) -> int:
             sys.exit(f"error: {error}")
         print(f"To send: {words.zip} ({words.zip.stat().st_size / 1e6:.0f} MB); unpacked, open its {REPORT.name}")
     return ended
+
+
+def _added(named: list[str] | None, project: Project) -> list[str]:
+    """The finished objects, or those that are named, without those that were not added to their scenes."""
+    from scenefuse.report.run_summary import is_added
+
+    # Results of rows that were removed or renamed stay.
+    folders = {name: Path("results/objects", name) for name in named or project.objects}
+    missing = [name for name, folder in folders.items() if not (folder / "fused.ply").is_file()]
+    if missing and (named or len(missing) == len(folders)):
+        if missing[0] in project.objects and not project.objects[missing[0]].get("scene"):
+            sys.exit(f"error: {missing[0]} lies in no scene: its result is {folders[missing[0]]}/object.ply, as it is")
+        which = f"{folders[missing[0]]}/fused.ply is not" if named else "no results/objects/NAME/fused.ply is"
+        sys.exit(f"error: {which} here ({Path.cwd()}); run the workflow first (scenefuse run)")
+    refused = [name for name in sorted(folders.keys() - {*missing}) if not is_added(folders[name])]
+    if refused and named:
+        sys.exit(f"error: {refused[0]} was not added to the scene, so there is no surface of it; {SUMMARY} says why")
+    if refused:
+        print(f"Left out: {', '.join(refused)}, not added to the scene; {SUMMARY} says why", flush=True)
+    return sorted(folders.keys() - {*missing, *refused})
 
 
 def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:

@@ -637,6 +637,47 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
     assert capsys.readouterr().out == exported
 
 
+def test_export_makes_no_surface_of_an_object_that_was_not_added(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_tables(["yard"], ["barn", "shed"])
+    for name, status in (("barn", "fused"), ("shed", "unregistered")):
+        write_json(tmp_path / f"results/objects/{name}/fusion.json", {"status": quantity(status, "")})
+        (tmp_path / f"results/objects/{name}/fused.ply").touch()
+    for name in ("scenes/yard/dense.ply", "scenes/yard/completed.ply", "summary/report.html"):
+        (tmp_path / "results" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "results" / name).touch()
+    runs = []
+    monkeypatch.setattr(subprocess, "run", lambda words, **_: runs.append(words) or subprocess.CompletedProcess([], 0))
+    monkeypatch.setattr(facts, "closing_lines", str)
+
+    def export(*words: str) -> set[str]:
+        runs.clear()
+        monkeypatch.setattr(sys, "argv", ["scenefuse", "export", *words])
+        with pytest.raises(SystemExit, match="^0$"):
+            command_line.main()
+        return {word.removeprefix("results/") for word in runs[0] if word.startswith("results/")}
+
+    of_all = {"scenes/yard/tiles", "summary/report.pdf"}
+    assert export() == {"objects/barn/surface.glb", "objects/barn/drawings", *of_all}
+    assert "Left out: shed, not added to the scene; results/summary/summary.txt says why" in capsys.readouterr().out
+    write_tables(["yard"], ["shed"])
+    assert export() == of_all
+    for words, sentence in (
+        (
+            ["--object", "shed"],
+            "shed was not added to the scene, so there is no surface of it; results/summary/summary",
+        ),
+        (["--what", "surface"], "there is nothing to export as surface; results/summary/summary.txt says"),
+    ):
+        monkeypatch.setattr(sys, "argv", ["scenefuse", "export", *words])
+        with pytest.raises(SystemExit, match=sentence):
+            command_line.main()
+    Path("config/objects.tsv").write_text("object\tphotos\tprompts\nbust\tphotos\tclicks.tsv\n")
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "export"])
+    with pytest.raises(SystemExit, match="bust lies in no scene: its result is results/objects/bust/object.ply"):
+        command_line.main()
+
+
 def test_a_zip_holds_the_page_and_what_it_links_to_so_that_links_work_where_it_is_unpacked(
     tmp_path: Path, monkeypatch, capsys
 ):

@@ -18,6 +18,7 @@ from scenefuse.core.settings import PACKAGE, ROOT as SHIPPED
 from scenefuse.core.machine import has_gpu, megapixels, memory_mb
 from scenefuse.photos.photo_files import camera_files, geo_file, photo_files, subtitles
 from scenefuse.core.stage import DISK_FULL, MIN_FREE_BYTES, StageError
+from scenefuse.report.run_summary import is_added
 
 # A file that a run holds until it ends, among Snakemake's locks and removed with them.
 RUN_LOCK = Path(".snakemake/locks/run")
@@ -313,13 +314,12 @@ def of_objects(path):
 
 
 def finished_folders(wildcards):
-    """The result folders of the objects of a scene that are fused; those that failed are left out."""
-    folders = object_folders(wildcards)
-    return [folder for folder in folders if Path(folder, "fused.ply").is_file()]
+    """The result folders of the objects of a scene that were added to it; those that failed or were refused are left out."""
+    return [folder for folder in object_folders(wildcards) if is_added(Path(folder))]
 
 
 def finished_in(path):
-    """Input function: a file of every fused object of the scene; `undistorted` of those with photos."""
+    """Input function: a file of every object that was added to the scene; `undistorted` of those with photos."""
     return lambda wildcards: [
         f"{folder}/{path}"
         for folder in finished_folders(wildcards)
