@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from scenefuse.core.transforms import Array
+from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.depth_test import MIN_AGREEING
+from scenefuse.geometry.photo_check import moved_view
 from scenefuse.photos.workspace import View
 
 Mask = NDArray[np.bool_]
@@ -170,15 +171,18 @@ def carve(
         height_of: heights (N,) over the ground of (N, 3) points along the box's axes; nothing below 0
             belongs to the object.
         silhouettes: cameras with masks as `pixels`; a photo counts for the voxels in its frame.
-        voxels: number along the longest side.
+        voxels: number along each side of a cube; of a pole's box there are as many in all.
         tolerance: share of the photos that show a voxel which may have it outside their mask.
         own: (N, 3) points on the object, for `least_framing`.
     """
-    size = (box.high - box.low).max() / voxels
+    size = np.cbrt((box.high - box.low).prod()) / voxels
     shape = np.maximum(np.ceil((box.high - box.low) / size).astype(int), 1)
     index = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
     x_in_box = box.low + (index + 0.5) * size
-    centres = box.to_object(x_in_box).astype(np.float32)
+    # About the box's middle: float32 has steps of half a metre in the coordinates of a UTM zone.
+    middle = box.to_object((box.low + box.high) / 2)
+    centres = (box.to_object(x_in_box) - middle).astype(np.float32)
+    silhouettes = [moved_view(view, Sim3(1.0, np.eye(3), -middle)) for view in silhouettes]
     alive = np.flatnonzero(height_of(x_in_box) > 0)
     shown, missed = (np.zeros(len(centres), dtype=np.int32) for _ in range(2))
     together = 4  # photos, after which the voxels that are decided are left out: most are, early
@@ -189,28 +193,32 @@ def carve(
         # A voxel outside more masks than all photos together could excuse is decided.
         alive = alive[missed[alive] <= tolerance * len(silhouettes)]
     occupied = np.zeros(len(centres), dtype=bool)
-    enough = shown[alive] >= least_framing(silhouettes, own)
+    enough = shown[alive] >= least_framing(silhouettes, own - middle)
     occupied[alive] = enough & (missed[alive] <= tolerance * shown[alive])
     grid = occupied.reshape(shape)
     shell = grid & ~ndimage.binary_erosion(grid)
-    return Hull(centres[shell.ravel()].astype(np.float64), float(size), float(grid.mean()))
+    return Hull(centres[shell.ravel()] + middle, float(size), float(grid.mean()))
 
 
 def silhouette(hull: Hull, view: View) -> Mask:
     """The hull as the photo sees it, (H, W)."""
-    drawn = np.zeros((view.height, view.width), dtype=np.uint8)
-    if len(hull.shell) == 0:
-        return drawn.astype(bool)
     pixels, depth = view.project(hull.shell)
     front = depth > 1e-6
     if not front.any():
-        return drawn.astype(bool)
-    u, v = np.floor(pixels[front]).astype(int).T
-    inside = (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
-    drawn[v[inside], u[inside]] = 255
-    side = hull.voxel * view.intrinsics[0, 0] / float(np.median(depth[front]))
+        return np.zeros((view.height, view.width), dtype=bool)
+    side = hull.voxel * view.intrinsics[0, 0] / depth[front]
     # Closing by a voxel joins the dots; a third of it more stands for the voxel's own extent.
-    reach = 2 * int(np.ceil(0.75 * side)) + 1
+    reach = 2 * int(np.ceil(0.75 * np.median(side))) + 1
+    # Nearer voxels, of a wall along which a photo looks, lie too far apart for it: they are drawn as large as they are.
+    half = np.where(side > reach / np.sqrt(2), side / 2, 0)[:, None]
+    low, high = np.floor(pixels[front] - half), np.floor(pixels[front] + half)
+    inside = (high >= 0).all(1) & (low < (view.width, view.height)).all(1)
+    drawn = np.zeros((view.height, view.width), dtype=np.uint8)
+    u, v = low[inside & (half[:, 0] == 0)].astype(int).T
+    drawn[v, u] = 255
+    large = np.concatenate([low, high + 1], axis=1)[inside & (half[:, 0] > 0)]
+    for left, top, right, bottom in np.clip(large, 0, max(drawn.shape)).astype(int).tolist():
+        drawn[top:bottom, left:right] = 255
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     return cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, kernel) > 0
 

@@ -50,12 +50,14 @@ def first_trimap(size: tuple[int, int], outline_px: NDArray[np.float64], spannin
     Args:
         size: (height, width).
         outline_px: (N, 2) pixels; nothing outside their convex hull is object.
-        spanning_px: (M, 2) projected points of the object, seen or hidden; their convex hull is likely object.
+        spanning_px: (M, 2) projected points of the object, seen or hidden, before the camera; their convex hull is
+            likely object.
     """
     trimap = np.full(size, cv2.GC_BGD, dtype=np.uint8)
     fill_hull(trimap, outline_px, cv2.GC_PR_BGD)
     likely = np.zeros(size, dtype=np.uint8)
-    fill_hull(likely, spanning_px, 1)
+    if len(spanning_px):
+        fill_hull(likely, spanning_px, 1)
     trimap[(trimap == cv2.GC_PR_BGD) & (likely > 0)] = cv2.GC_PR_FGD
     return trimap
 
@@ -253,8 +255,8 @@ def first_cuts(target: Target, photos: Workspace, width_px: int, clicked: Mappin
     """
     masks = []
     for k, (view, seen, seen_at) in enumerate(zip(photos.views, photos.seen, photos.seen_at)):
-        outline, spanning = target.outline(view), view.project(target.spanning)[0]
-        trimap = first_trimap((view.height, view.width), outline, spanning)
+        spanning, depth = view.project(target.spanning)
+        trimap = first_trimap((view.height, view.width), target.outline(view), spanning[depth > 0])
         stamp(trimap, target, view, seen, seen_at, clicked.get(k))
         if clicked:
             grow_seeds(view.pixels, trimap, COARSE_WIDTH_PX)

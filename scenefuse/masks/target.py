@@ -149,7 +149,7 @@ def upright_box(points: Array, up: Array, margin: float) -> Box:
     axes = np.stack([x, np.cross(z, x), z], axis=1)
     flat = points @ axes
     if len(points) >= 3:
-        angle = np.radians(cv2.minAreaRect(flat[:, :2].astype(np.float32))[2])
+        angle = np.radians(cv2.minAreaRect((flat - flat.mean(0))[:, :2].astype(np.float32))[2])
         turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         axes = axes @ turn
         flat = points @ axes

@@ -1,6 +1,8 @@
-"""Photos that show a part of the object only: a long facade, many photos of a statue's head, a mask that lacks it."""
+"""Photos that show a part of the object only: a long facade, many photos of a statue's head, a mask that lacks it; and
+a thin pole, a wall along which photos look, cameras in the coordinates of a map."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,12 +12,14 @@ from scipy import ndimage
 from scenefuse.core.transforms import Sim3
 from scenefuse.crop.marked import Masked, vote
 from scenefuse.geometry.ground import Ground
-from scenefuse.geometry.photo_check import covering
-from scenefuse.geometry.visual_hull import Box, Outline, least_framing
+from scenefuse.geometry.photo_check import covering, moved_view
+from scenefuse.geometry.visual_hull import Box, Hull, Outline, least_framing, mask_iou, silhouette
+from scenefuse.masks.grabcut import first_cuts
 from scenefuse.masks.segmentation import MaskSettings, score_masks
+from scenefuse.masks.target import target_from_points, upright_box
 from scenefuse.mvs.photo_refinement import choose_sources
 from scenefuse.nerf.volume import find_volume
-from scenefuse.photos.workspace import View
+from scenefuse.photos.workspace import View, Workspace
 
 CELLS = 64
 FACADE = [((-15.0, 0.0, 0.0), (15.0, 1.0, 9.0))]
@@ -38,7 +42,7 @@ def photo(name, centre, target, degrees, boxes, width=160, height=120):
     for low, high in boxes:
         with np.errstate(divide="ignore", invalid="ignore"):
             a, b = (np.array(low) - centre) / rays, (np.array(high) - centre) / rays
-        hit |= np.minimum(a, b).max(1) < np.maximum(np.maximum(a, b).min(1), 0)
+        hit |= np.maximum(np.minimum(a, b).max(1), 0) < np.maximum(a, b).min(1)
     return View(name, lens, pose, width, height, hit.reshape(height, width))
 
 
@@ -124,6 +128,46 @@ def test_one_mask_that_lacks_the_head_takes_it_from_no_object():
     volume = find_volume([Outline(view) for view in photos], CELLS, 0.04, own=surface(STATUE))
     head = surface(STATUE)[-1500:]
     assert share_in(volume, head[head[:, 2] > 1.6]) > 0.95
+
+
+def test_masks_of_a_thin_pole_agree_with_their_hull():
+    pole = [((-0.05, -0.05, 0.0), (0.05, 0.05, 6.0))]
+    photos = [photo(f"{k}", ring(k, 12, 6.0, 2.0), (0, 0, 3), 65, pole, 320, 400) for k in range(12)]
+    scored = score_masks([view.pixels for view in photos], target(pole), photos, MaskSettings(hull_voxels=80))
+    assert not scored.dropped
+
+
+def test_a_hull_of_a_wall_has_no_holes_where_the_photo_is_near():
+    along = photo("", (-12.0, -2.0, 1.7), (-4, 0, 3), 60, FACADE, 640, 480)
+    cells = np.meshgrid(*(np.arange(low + 0.25, high, 0.5) for low, high in zip(*FACADE[0])), indexing="ij")
+    hull = Hull(np.stack(cells, axis=-1).reshape(-1, 3), 0.5, 1.0)
+    assert mask_iou(along.pixels, silhouette(hull, along)) > 0.95
+
+
+def test_grabcut_is_not_misled_by_the_ends_of_a_wall_that_lie_behind_the_camera():
+    along = photo("", (-12.0, -2.0, 1.7), (-6, 0, 3), 60, FACADE, 160, 120)
+    colours = np.where(along.pixels[..., None], [170, 90, 60], [60, 120, 180])
+    colours = np.clip(colours + np.random.default_rng(0).normal(0, 12, colours.shape), 0, 255).astype(np.uint8)
+    corners = np.array([[x, y, z] for x in (-15, 15) for y in (0, 1) for z in (0, 9.0)])
+    nothing = np.zeros((0, 3)), [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+    photos = Workspace(Path(), [replace(along, pixels=colours)], *nothing)
+    found = first_cuts(target_from_points(corners, photos, np.array([0, 0, 1.0]), 0), photos, 160, {})
+    assert mask_iou(found[0], along.pixels) > 0.95
+
+
+def test_masks_agree_as_well_where_cameras_are_in_the_coordinates_of_a_map():
+    photos, own, up = around_a_statue(12, 0), surface(STATUE), np.array([0, 0, 1.0])
+    scores, corners = [], []
+    for at in (np.zeros(3), np.array([456_789.0, 5_432_100.0, 300.0])):
+        views = [moved_view(view, Sim3(1.0, np.eye(3), at)) for view in photos]
+        box = upright_box(own + at, up, 0.15)
+        ground = Ground(np.array([at[2], 0, 0, 0, 0, 0]), np.zeros(2))
+        there = SimpleNamespace(box=box, ground=ground, sparse=own + at, kind=np.ones(len(own), np.int8))
+        scored = score_masks([view.pixels for view in views], there, views, MaskSettings(hull_voxels=80))
+        scores.append(list(scored.scores.values()))
+        corners.append(box.corners() - at)
+    np.testing.assert_allclose(scores[1], scores[0], atol=0.01)
+    np.testing.assert_allclose(corners[1], corners[0], atol=1e-3)
 
 
 def test_how_many_photos_frame_a_place():
