@@ -210,6 +210,9 @@ def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Worksp
     if 2 * sum(map(bool, holes)) > len(holes):
         raise StageError(f"the masks in {inputs.supplied} are black on the object; invert them: it has to be white")
     missing = {view.name: "no mask was supplied" for view in photos.views if view.name not in found}
+    # Programs write a black mask of each photo in which nothing was drawn: it denies no point.
+    missing |= {name: "empty mask" for name, mask in found.items() if not mask.any()}
+    found = {name: mask for name, mask in found.items() if mask.any()}
     photos = photos.subset([k for k, view in enumerate(photos.views) if view.name in found])
     return [found[view.name] for view in photos.views], photos, missing | unusable
 

@@ -202,6 +202,17 @@ def test_masks_that_are_black_on_the_object_are_an_error(capture, tmp_path):
         run_stage(capture, tmp_path, method="supplied", prompts=None, supplied=supplied)
 
 
+def test_black_masks_of_photos_in_which_nothing_was_drawn_deny_nothing(capture, tmp_path):
+    supplied = tmp_path / "supplied"
+    shutil.copytree(capture / "truth", supplied)
+    for name in ("f1", "f4", "f6"):
+        cv2.imwrite(str(supplied / f"{name}_mask.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    run_stage(capture, tmp_path, method="supplied", prompts=None, supplied=supplied)
+    report = read_json(tmp_path / "masks.json")
+    assert report["dropped"] == dict.fromkeys(["f1.png", "f4.png", "f6.png"], "empty mask")
+    assert value(report, "median_agreement") > 0.9
+
+
 def test_bad_supplied_masks_are_left_out_with_their_reason(capture, tmp_path):
     supplied = tmp_path / "supplied"
     shutil.copytree(capture / "truth", supplied)
