@@ -118,7 +118,7 @@ def _named(photos: list[PosedPhoto], folder: Path) -> list[PosedPhoto]:
 def _write_photo(
     photo: PosedPhoto, lens: Lens, mask: Path | None, exact: bool, bits: int, images: Path, mattes: Path
 ) -> View | None:
-    """Write one photo and its matte; returns its view by the name that it got, None for a photo without a mask.
+    """Write one photo and its matte; returns its view by the name that it got, None without a mask, or for a black one.
 
     Args:
         photo, lens: what to write, and its cameras.
@@ -130,7 +130,7 @@ def _write_photo(
     camera, view = lens
     picture, alpha = _read(photo.file, bits)
     matte = alpha if exact else _mask(mask, picture)
-    if matte is None:
+    if matte is None or not (matte > 127).any():
         return None
     stem, straight = Path(photo.name).stem, _straight(camera)
     if straight and not exact and not bits:
@@ -179,11 +179,7 @@ def _straight(camera: pycolmap.Camera) -> bool:
 
 
 def _lenses(photos: list[PosedPhoto], settings: UndistortSettings) -> list[Lens]:
-    """Of every photo, its camera at its own size, and the view without distortion that it becomes.
-
-    Undistorted photos that had one size get one size: cameras calibrated photo by photo lose a few columns and rows at
-    the right and the bottom.
-    """
+    """Of every photo, its camera at its own size, and the view without distortion that it becomes."""
     options = pycolmap.UndistortCameraOptions(max_image_size=settings.max_size_px)
     pairs = []
     for photo in photos:
@@ -193,13 +189,7 @@ def _lenses(photos: list[PosedPhoto], settings: UndistortSettings) -> list[Lens]
         intrinsics: Array = np.array(target.calibration_matrix(), dtype=np.float64)
         view = View(photo.name, intrinsics, cam_from_object, target.width, target.height)
         pairs.append((camera, view))
-    smallest: dict[tuple[int, int], tuple[int, int]] = {}
-    for camera, view in pairs:
-        own = camera.width, camera.height
-        known = smallest.get(own, (view.width, view.height))
-        smallest[own] = min(known[0], view.width), min(known[1], view.height)
-    sizes = [smallest[camera.width, camera.height] for camera, _ in pairs]
-    return [(c, replace(view, width=width, height=height)) for (c, view), (width, height) in zip(pairs, sizes)]
+    return pairs
 
 
 def _read(file: Path, bits: int) -> tuple[Picture, Picture | None]:

@@ -71,7 +71,8 @@ def load_views(workspace: Path, masks: Path, width_px: int, hold_out_every: int)
     """Read an undistorted COLMAP workspace and its masks, scaled to `width_px` columns.
 
     Photos of several sizes, upright ones among others for instance, get about as many pixels each, the widest of them
-    `width_px` columns, and lie at the upper left of pictures that hold them all.
+    `width_px` columns, and lie at the upper left of pictures that hold them all. A photo whose mask holds no pixel of
+    that size is left out.
 
     Args:
         workspace: folder with images/ and sparse/, PINHOLE cameras.
@@ -87,13 +88,15 @@ def load_views(workspace: Path, masks: Path, width_px: int, hold_out_every: int)
     files = [masks / f"{Path(view.name).stem}.png" for view in read.views]
     read = read.subset([k for k, file in enumerate(files) if file.is_file()])
     files = [file for file in files if file.is_file()]
-    if not files:
+    factors = scales(read.views, width_px) if files else []
+    mattes = [_scaled(with_mask(view, file), scale) for file, view, scale in zip(files, read.views, factors)]
+    shown = [k for k, matte in enumerate(mattes) if (matte.pixels > 127).any()]
+    if not shown:
         raise StageError(
             f"no photo in {workspace} has a mask in {masks}; mask files are named like their photo, with .png"
         )
-    factors = scales(read.views, width_px)
-    photos = [_scaled(read.rgb(view), scale) for view, scale in zip(read.views, factors)]
-    mattes = [_scaled(with_mask(view, file), scale) for file, view, scale in zip(files, read.views, factors)]
+    read, mattes = read.subset(shown), [mattes[k] for k in shown]
+    photos = [_scaled(read.rgb(view), factors[k]) for view, k in zip(read.views, shown)]
     shape = max(view.height for view in photos), max(view.width for view in photos)
     return Views(
         [view.name for view in photos],

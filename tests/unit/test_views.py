@@ -111,6 +111,15 @@ def _scaled_sizes(views, width_px):
     return [(round(v.width * s), round(v.height * s)) for v, s in zip(views, scales(views, width_px))]
 
 
+def test_a_photo_whose_mask_is_smaller_than_a_pixel_is_left_out(folder):
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[30, 41] = 255
+    cv2.imwrite(str(folder / "masks" / "2.png"), mask)
+    views = load_views(folder, folder / "masks", width_px=40, hold_out_every=3)
+    assert views.names == ["1.png", "3.png", "4.png"] and views.held_out.tolist() == [False, True, False]
+    assert views.masks.any((1, 2)).all() and (views.images[1] == (120, 20, 10)).all() and len(views.tracks) == 3
+
+
 def test_held_out_photos_are_every_nth_or_listed(folder):
     assert load_views(folder, folder / "masks", 40, 2).held_out.tolist() == [False, True, False, True]
     (folder / "held_out.txt").write_text("4.png\n1.png\n")
