@@ -92,7 +92,8 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
         inputs, inputs.object_workspace, Sim3.from_matrix(np.array(value(fusion, "scene_from_object")))
     )
     cameras = masks or photos[0].views
-    near, around_it = _surroundings(inputs, obj, reach_of_stations(obj, cameras) if cameras else 0.0)
+    views = photos[0].views + photos[1].views
+    near, around_it = _surroundings(inputs, obj, views, reach_of_stations(obj, cameras) if cameras else 0.0)
     missing = find_missing_surface(obj, near[around(near, obj)], photos, masks)
     plan = plan_stations(missing, obj, around_it, cameras)
     write_cloud(outputs.missing, missing.cells)
@@ -114,14 +115,15 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     write_json(outputs.report, content)
 
 
-def _surroundings(inputs: MissingInputs, obj: Cloud, reach: float) -> tuple[Cloud, Cloud]:
-    """The scene after fusion within a diagonal of the object, with normals; and the same as far as `reach`.
+def _surroundings(inputs: MissingInputs, obj: Cloud, views: list[View], reach: float) -> tuple[Cloud, Cloud]:
+    """The scene after fusion within a diagonal of the object, with normals; and the same as far as `reach`. `views` are
+    the photos of both.
 
     What is farther off is thinned to a quarter of a camera's clearance, without normals, part by part.
     """
     scene, changes, added = open_cloud(inputs.scene), read_changes(inputs.checked), added_by(inputs.fused)
     low, high, beside = obj.points.min(0), obj.points.max(0), obj.diagonal
-    near = with_normals(together(changes.left_of(*scene.near(low - beside, high + beside)), added))
+    near = with_normals(together(changes.left_of(*scene.near(low - beside, high + beside)), added), views)
     tiles, far = scene.touching(low - reach, high + reach), [near.points]
     for some in np.array_split(tiles, 1 + np.diff(scene.starts)[tiles].sum() // AT_ONCE):
         points = changes.left_of(*scene.read(some)).points
@@ -134,9 +136,9 @@ def _surroundings(inputs: MissingInputs, obj: Cloud, reach: float) -> tuple[Clou
 
 def _in_scene(inputs: MissingInputs, workspace: Path, pose: Sim3) -> tuple[Cloud, tuple[Photos, Photos], list[View]]:
     """The object's cloud, the photos of both sides, and the object's masks, all in the scene's frame."""
-    own = with_normals(read_cloud(inputs.object))
-    obj = own.transformed(pose)
-    photos = photos_of(workspace, own.points, pose), photos_of(inputs.scene_workspace, obj.points)
+    own = read_cloud(inputs.object)
+    photos = photos_of(workspace, own.points, pose), photos_of(inputs.scene_workspace, pose.apply(own.points))
+    obj = with_normals(own.transformed(pose), photos[0].views + photos[1].views)
     if inputs.masks is None:
         return obj, photos, []
     views = [(view, inputs.masks / f"{Path(view.name).stem}.png") for view in photos[0].views]

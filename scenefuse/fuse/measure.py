@@ -1,5 +1,6 @@
 """Measure: which points of a cloud photos confirm, how exactly, and the fields in which a fused cloud says so (F4)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
@@ -15,6 +16,7 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.icp import similarity_rows
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Matches, Photos, match_in
 from scenefuse.geometry.surface import normals_at
+from scenefuse.photos.workspace import View
 
 
 class Evidence(IntEnum):
@@ -61,7 +63,7 @@ class Measured:
 
 def measure(cloud: Cloud, photos: Photos, diagonal: float) -> Measured:
     """Match a cloud's points in photos of the same frame; diagonal: of the object."""
-    cloud = with_normals(cloud)
+    cloud = with_normals(cloud, photos.views)
     matches = match_in(cloud.points, cloud.normals, photos)
     return Measured(cloud, matches, supported(cloud.points, matches.measured, diagonal))
 
@@ -96,13 +98,19 @@ def supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> ND
     return found
 
 
-def with_normals(cloud: Cloud) -> Cloud:
-    """The cloud, with normals of local planes where it has none; their side is unknown then."""
+def with_normals(cloud: Cloud, views: Sequence[View] = ()) -> Cloud:
+    """The cloud, with normals of local planes where it has none, towards the nearest camera; without cameras their side
+    is unknown."""
     if cloud.normals is not None:
         return cloud
     if len(cloud) < 3:
         return replace(cloud, normals=np.tile(np.array([0, 0, 1], np.float32), (len(cloud), 1)))
-    return replace(cloud, normals=normals_at(cloud.points, cloud.points).astype(np.float32))
+    normals = normals_at(cloud.points, cloud.points)
+    if views:
+        centres = np.array([view.centre for view in views])
+        towards = centres[cKDTree(centres).query(cloud.points, workers=threads())[1]] - cloud.points
+        normals *= np.where((towards * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
+    return replace(cloud, normals=normals.astype(np.float32))
 
 
 def with_evidence(known: Measured, otherwise: Evidence, of_pose: Array | float = 0.0) -> Cloud:

@@ -178,9 +178,10 @@ def check(
         on_world: see `fuse_by_evidence`.
     """
     diagonal, chosen = obj.diagonal, np.sort(sampled_rows(len(scene), MAX_CHECKED, seed=0))
-    notes = _photo_notes(obj_photos, scene_photos)
+    notes, views = _photo_notes(obj_photos, scene_photos), obj_photos.views + scene_photos.views
+    obj, given = with_normals(obj, views), with_normals(scene[chosen], views)
     mine = measure(obj, obj_photos if _is_enough(obj_photos) else scene_photos, diagonal)
-    theirs = measure(scene[chosen], scene_photos if _is_enough(scene_photos) else obj_photos, diagonal)
+    theirs = measure(given, scene_photos if _is_enough(scene_photos) else obj_photos, diagonal)
     if not mine.surface.any():
         notes.append("no photo confirms any point of the object, so nothing is added")
 

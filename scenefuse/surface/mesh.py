@@ -142,13 +142,9 @@ def oriented(cloud: Cloud, views: list[View]) -> Cloud:
     without cameras consistent with their neighbours."""
     if cloud.normals is not None:
         return cloud
-    cloud = with_normals(cloud)
-    assert cloud.normals is not None
+    cloud = with_normals(cloud, views)
     if views:
-        centres = np.array([view.centre for view in views])
-        towards = centres[cKDTree(centres).query(cloud.points)[1]] - cloud.points
-        behind = (towards * cloud.normals).sum(1) < 0
-        return replace(cloud, normals=np.where(behind[:, None], -cloud.normals, cloud.normals))
+        return cloud
     points = _open3d_cloud(cloud, cloud.points.mean(0))
     points.orient_normals_consistent_tangent_plane(NEIGHBOURS)
     return replace(cloud, normals=np.asarray(points.normals).astype(np.float32))

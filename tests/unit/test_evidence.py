@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.photographed_plane import BLANK, photographs
 
 from scenefuse.cloud.clouds import Cloud, concatenate
@@ -55,6 +56,17 @@ def test_the_sharper_side_stays_where_both_measured(near, far):
     found = check(scene, obj, farther, near, nerf_only=False)
     assert found.added[scene.points[:, 0] < 0.3].mean() < 0.05 and found.added[scene.points[:, 0] > 0.5].mean() > 0.9
     assert (found.reason == Reason.KEPT).all()
+
+
+@pytest.mark.parametrize("bare", ["object", "scene"])
+def test_a_cloud_without_normals_is_measured_as_one_with_them(near, far, bare):
+    # Turned, so that no side of a plane comes out by chance.
+    turn = Sim3(1.0, Rotation.random(random_state=0).as_matrix(), np.zeros(3))
+    obj, scene = (sheet(*ends, 0.06).transformed(turn) for ends in ((-0.8, 0.4), (-0.4, 0.8)))
+    obj, scene = (replace(c, normals=None) if bare == name else c for name, c in (("object", obj), ("scene", scene)))
+    found = check(obj, scene, moved_photos(near, turn), moved_photos(far, turn), nerf_only=False)
+    assert (found.obj.fields["evidence"] == Evidence.MEASURED).mean() > 0.95 and found.added.mean() > 0.95
+    assert (found.scene.fields["evidence"] == Evidence.MEASURED).mean() > 0.95
 
 
 def test_a_rough_object_does_not_take_the_place_of_a_smooth_scene(near, far):
