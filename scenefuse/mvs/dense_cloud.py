@@ -27,7 +27,8 @@ from scenefuse.photos.workspace import View, read_views
 
 # Share of the measured pixels below which the cameras or the limits are probably wrong.
 MIN_FUSED_SHARE = 0.01
-# A point is dropped where the mean distance of its neighbours is more than so many times the cloud's median.
+# A point is dropped where the mean distance of its neighbours, in pixels of its photo, is more than so many times the
+# cloud's median.
 OUTLIER_RATIO = 4.0
 
 
@@ -87,7 +88,7 @@ def fuse_depth_maps(
             f"no point is seen alike by {settings.min_photos} photos; lower scene.dense_cloud.min_photos, or check the"
             " cameras"
         )
-    near = near_others(fused.points)
+    near = near_others(fused.points, fused.fields.pop("pixel"))
     kept = voxel_downsample(fused[near], pixel)
     print(f"{len(kept)} points, {(~near).sum()} of {len(fused)} dropped as outliers before thinning", flush=True)
     content = _report(kept, measured, stages, length_unit(georeference_json))
@@ -123,8 +124,8 @@ def _report(cloud: Cloud, measured: int, stages: list[dict[str, Any]], unit: str
 def _fuse(
     workspace: Path, maps: Mapping[str, Path], near: Mapping[str, list[str]], settings: DenseCloudSettings
 ) -> tuple[Cloud, float, int]:
-    """A cloud with `views` of the pixels that enough maps confirm, the size of the finest map's pixels on the surface,
-    and how many pixels have a depth.
+    """A cloud of the pixels that enough maps confirm, with `views` and the size of each, `pixel`; that of the finest
+    map's pixels on the surface; and how many pixels have a depth.
 
     Where several maps show a place, the finest one gives its points.
 
@@ -188,16 +189,16 @@ def _points(own: DepthMap, votes: Votes) -> Cloud:
     depth, normals, colors = np.split(votes.mean[rows, columns], [1, 4], axis=1)
     points = back_project(depth[:, 0].astype(np.float64), own.view.intrinsics, own.view.world_from_cam, rows, columns)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Cloud(
-        points, normals, np.rint(colors).astype(np.uint8), {"views": votes.agree[rows, columns] + np.uint16(1)}
-    )
+    fields = {"views": votes.agree[rows, columns] + np.uint16(1), "pixel": depth[:, 0] / own.view.intrinsics[0, 0]}
+    return Cloud(points, normals, np.rint(colors).astype(np.uint8), fields)
 
 
-def near_others(points: Array) -> NDArray[np.bool_]:
-    """(N,) True where a point's neighbours are about as near as they are for the others."""
+def near_others(points: Array, pixel: Array | float = 1.0) -> NDArray[np.bool_]:
+    """(N,) True where a point's neighbours are about as near as they are for the others, in sizes of its pixel (N,)."""
     if len(points) <= NEIGHBOURS:
         return np.ones(len(points), dtype=bool)
     tree, distance = cKDTree(points), np.empty(len(points))
     for rows in np.array_split(np.arange(len(points)), -(-len(points) // WHOLE)):
         distance[rows] = tree.query(points[rows], k=NEIGHBOURS + 1, workers=threads())[0][:, 1:].mean(1)
+    distance /= pixel
     return distance <= OUTLIER_RATIO * np.median(distance)

@@ -18,7 +18,7 @@ from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
 from scenefuse.mvs.depth_maps import estimate_depth_maps
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.photos.pictures import read_depth, read_normals, write_depth, write_normals
-from scenefuse.photos.workspace import View
+from scenefuse.photos.workspace import View, write_model
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 DEPTH = DepthMapSettings(
@@ -188,6 +188,39 @@ def test_a_cloud_of_few_of_the_measured_pixels_is_noted(workspace, maps, tmp_pat
     report = read_json(tmp_path / "dense.json")
     assert 0 < value(report, "fused_share") < 0.01
     assert "of the pixels with a depth are in the cloud" in value(report, "notes")[0]
+
+
+def test_a_high_flight_stays_beside_a_low_one(tmp_path):
+    # Over a level ground at z = 0 the photos of one flight have pixels ten times as large as those of the other.
+    lens = np.array([[75.0, 0, 40], [0, 75, 30], [0, 0, 1]])
+    shifts, views, names = [(0, 0), (0.1, 0), (0, 0.1), (-0.1, 0), (0, -0.1)], [], []
+    for part in ("images", "sparse", "maps"):
+        (tmp_path / part).mkdir()
+    for height in (2.0, 20.0):
+        for x, y in shifts:
+            pose = np.column_stack([np.eye(3), [-x * height, -y * height, height]])
+            names.append(f"{height:02.0f}{x}{y}.png")
+            views.append(View(names[-1], lens, np.vstack([pose, [0, 0, 0, 1]]), 80, 60))
+            cv2.imwrite(str(tmp_path / "images" / names[-1]), np.full((60, 80, 3), 90, np.uint8))
+            write_depth(tmp_path / "maps/depth_maps" / f"{names[-1]}.bin", np.full((60, 80), height, np.float32))
+            normals = np.tile(np.array([0, 0, -1], np.float32), (60, 80, 1))
+            write_normals(tmp_path / "maps/normal_maps" / f"{names[-1]}.bin", normals)
+    write_model(tmp_path / "sparse", views)
+    photos = {name: {"sources": [other for other in names if other != name]} for name in names}
+    said = {key: quantity("", "") for key in ("backend", "device", "reason")}
+    write_json(tmp_path / "maps.json", said | {"photos": photos})
+    fuse_depth_maps(
+        workspace=tmp_path,
+        depth=[tmp_path / "maps"],
+        depth_json=[tmp_path / "maps.json"],
+        settings=DenseCloudSettings(),
+        cloud=tmp_path / "dense.ply",
+        report=tmp_path / "dense.json",
+    )
+    cloud = read_cloud(tmp_path / "dense.ply")
+    assert set(cloud.fields) == {"views"}
+    apart = np.abs(cloud.points[:, :2]).max(1)
+    assert (apart < 0.5).sum() > 1000 and ((apart > 2) & (apart < 7)).sum() > 1000
 
 
 def test_a_point_far_from_all_others_is_found_in_clouds_of_any_size(monkeypatch):
