@@ -193,6 +193,8 @@ def scene_facts(row: Row) -> dict[str, str]:
     unit = has.get("length_unit", "scene units")
     if "error" in has:
         facts["Result"] = f"no dense cloud: {has['error']}"
+    elif has.get("completed_by") == "none":
+        facts["Result"] = f"not completed, for no object was added; {has['completed_points']:,.0f} points, as before"
     elif "completed_points" in has:
         facts["Result"] = f"completed with {has['completed_by']}; {has['completed_points']:,.0f} points"
         if "removed_points" in has and "points" in has:
@@ -278,7 +280,7 @@ def closing_lines(summary: Path) -> str:
         *(
             summary.parent / f"scenes/{row['scene']}/completed.ply"
             for row in map(_known, scenes)
-            if "completed_points" in row
+            if row.get("completed_by", "none") != "none"
         ),
         *(summary.parent / f"objects/{row['object']}/object.ply" for row in objects if row["status"] == ALONE),
     ]

@@ -628,6 +628,14 @@ def test_lengths_of_an_object_in_a_scene_without_a_scale_are_not_trusted_in_metr
     assert object_facts(row)["Scale"] == "Trust it to 1.1 % (standard deviation), beside the scene's, not in metres"
 
 
+def test_a_scene_to_which_nothing_was_added_is_not_called_completed(results):
+    nothing = {"points": quantity(5000, "points"), "added_points": quantity({}, "points")}
+    write_json(results / "scenes/demo/completed.json", nothing)
+    summary = summarise(results, ["balloon"])
+    assert "Not completed, for no object was added; 5,000 points, as before" in (summary / "summary.txt").read_text()
+    assert closing_lines(summary).startswith("Result: 0 of 1 objects completed\n")
+
+
 def test_what_is_completed_in_part_alone_is_not_called_completed():
     row = {"object": "house", "status": "registered", "surface_missing": 0.913, "surface_never_seen": 0.913}
     assert object_facts(row)["Result"] == "Found in the scene and completed to 8.7 %"
