@@ -257,10 +257,10 @@ def _alignment(path: Path) -> Sim3:
     alignment = read_json(path)
     if not value(alignment, "found"):
         raise StageError(
-            "there are no fiducials, and shared features give no alignment of the object with the scene"
-            f" ({value(alignment, 'reason')}; see {path}): click on the object in one of the scene's photos"
-            " and name the file in the column fiducials of the objects table, or add photos of the object that"
-            " show its surroundings too, from as far away as the scene's"
+            "shared features give no alignment of the object with the scene"
+            f" ({value(alignment, 'reason')}; see {path}): if one of the scene's photos shows the object, click on it"
+            f" there (scenefuse pick --object {path.parent.name}, key t; column fiducials of the objects table), or add"
+            " photos of the object that show its surroundings too, from as far away as the scene's"
         )
     return Sim3.from_matrix(np.array(value(alignment, "scene_from_object")))
 

@@ -327,6 +327,17 @@ def masked(inputs, folder, alignment_json):
     return replace(inputs, fiducials=None, **marks)
 
 
+def test_an_object_that_nothing_links_with_its_scene_is_to_be_clicked_there(orbit, tmp_path):
+    folder, trial = orbit
+    files, alignment = stage_files(tmp_path, trial, trial.fiducials), tmp_path / "shed/alignment.json"
+    write_json(alignment, {"found": quantity(False, ""), "reason": quantity("nothing is alike", "")})
+    inputs = masked(files["inputs"], folder, alignment)
+    with pytest.raises(
+        StageError, match=r"nothing is alike; .*: if one .* click on it there \(scenefuse pick --object shed,"
+    ):
+        crop_scene(**files | {"inputs": inputs}, settings=SETTINGS)
+
+
 def test_a_mask_of_another_size_is_one_sentence(orbit, tmp_path):
     folder, _ = orbit
     shutil.copytree(folder / "masks", tmp_path / "masks")
