@@ -9,7 +9,7 @@ import struct
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -137,7 +137,7 @@ def photo_files(folder: Path) -> list[Path]:
 
 def distinct_photos(folder: Path) -> tuple[list[str], list[str]]:
     """Relative names of the photos below a folder (`photo_files`), sorted, of which none is another's file again, byte
-    for byte; and notes that name pictures that were left out.
+    for byte or in fewer pixels; and notes that name pictures that were left out.
 
     A copy sees nothing that its original does not, but would count as one more photo that confirms it. The shortest
     name stays.
@@ -162,10 +162,37 @@ def distinct_photos(folder: Path) -> tuple[list[str], list[str]]:
             first = kept.setdefault(sha256(folder / name), name)
             if first != name:
                 first_of[name] = first
-    if first_of:
-        one = f"{(copy := min(first_of))} of {first_of[copy]}"
-        notes.append(f"{len(first_of)} photos are copies of others, byte for byte, and are left out ({one})")
-    return [name for name in names if name not in first_of], notes
+    smaller = _smaller_copies(folder, [name for name in names if name not in first_of])
+    for found, how in ((first_of, "copies of others, byte for byte,"), (smaller, "smaller copies of the same shots")):
+        if found:
+            one = f"{(copy := min(found))} of {found[copy]}"
+            notes.append(f"{len(found)} photos are {how} and are left out ({one})")
+    return [name for name in names if name not in first_of | smaller], notes
+
+
+def _smaller_copies(folder: Path, names: list[str]) -> dict[str, str]:
+    """Photos of which another folder holds the same shot, by its name, time and camera, in more pixels; and that one.
+
+    Cameras of a rig may agree in all that, but in the number of pixels too.
+    """
+    from PIL.ExifTags import IFD, Base
+
+    by_name, found = defaultdict[str, list[str]](list), dict[str, str]()
+    for name in names:
+        by_name[_stem(name.rpartition("/")[2].casefold())].append(name)
+    for alike in (group for group in by_name.values() if len(group) > 1):
+        largest = dict[tuple[str, ...], tuple[int, str]]()
+        pixels = dict[str, tuple[int, tuple[str, ...]]]()
+        for name in alike:
+            with suppress(StageError), open_picture(folder / name) as image:
+                exif = image.getexif()
+                taken = exif.get_ifd(IFD.Exif)
+                if when := taken.get(Base.DateTimeOriginal):
+                    shot = (str(when), str(taken.get(Base.SubsecTimeOriginal)), str(exif.get(Base.Model)))
+                    pixels[name] = image.width * image.height, shot
+                    largest[shot] = max(largest.get(shot, (0, "")), (pixels[name][0], name))
+        found |= {name: largest[shot][1] for name, (count, shot) in pixels.items() if count < largest[shot][0]}
+    return found
 
 
 def geo_file(folder: Path) -> Path | None:

@@ -108,6 +108,24 @@ def test_rotated_photos_are_stood_upright_and_the_others_linked(tmp_path):
     assert value(read_json(tmp_path / "photos.json"), "turned") == {"sub/b.jpg": 6}
 
 
+def test_smaller_copies_of_a_shot_are_left_out_and_photos_of_a_rig_stay(tmp_path):
+    def shot(name, size, when="2026:05:01 12:00:00"):
+        exif = Image.Exif()
+        exif[0x0110], exif[0x8769] = "Camera", {0x9003: when} if when else {}
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", size, (0, len(name), size[0])).save(tmp_path / name, exif=exif)
+
+    for name, size in (("p/1.JPG", (40, 30)), ("p/web/1.jpg", (20, 15)), ("p/left/2.jpg", (40, 30))):
+        shot(name, size)
+    shot("p/right/2.jpg", (40, 30))
+    shot("p/later/1.jpg", (20, 15), "2026:05:01 12:00:09")
+    shot("p/undated/1.jpg", (20, 15), "")
+    names = [photo.name for photo in listed(tmp_path, tmp_path / "p")]
+    assert names == ["1.JPG", "later/1.jpg", "left/2.jpg", "right/2.jpg", "undated/1.jpg"]
+    notes = value(read_json(tmp_path / "photos.json"), "notes")
+    assert notes[0] == "1 photos are smaller copies of the same shots and are left out (web/1.jpg of 1.JPG)"
+
+
 @pytest.mark.parametrize("place", ["photos", "project/photos"])
 def test_a_project_that_is_moved_finds_its_photos_as_its_table_does(tmp_path, monkeypatch, place):
     save(tmp_path / place / "a.jpg")
