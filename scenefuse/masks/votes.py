@@ -1,7 +1,8 @@
 """What the masks of photos say of the sparse points, and so of each other."""
 
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,14 @@ class Voter:
         """Whether it is what a person clicked, which no other photo overrules."""
         return self.can_vote and self.clicks.enough
 
+    @cached_property
+    def extent(self) -> float:
+        """Diagonal of the mask's box in pixels; 0 where the mask does not end before the photo does."""
+        if not is_whole(self.mask):
+            return 0.0
+        rows, columns = (np.flatnonzero(self.mask.any(axis)) for axis in (1, 0))
+        return float(np.hypot(np.ptp(rows), np.ptp(columns)))
+
 
 def voter_of(photos: Workspace, k: int, mask: Mask, quality: float, agreement: float, clicks: PhotoClicks) -> Voter:
     """What a photo's mask says of the points that the photo sees, but for those next to its outline."""
@@ -95,16 +104,13 @@ def vote_shares(photos: Workspace, made: dict[int, Voter]) -> Array:
         return votes / total
 
 
-def _largest(views: list[View], own: Array) -> float:
-    """How large an object can be: as its largest mask (`pixels`), at the middle depth of its points (N, 3), in their
-    unit; infinite where few photos show it whole."""
-    whole = [view for view in views if is_whole(view.pixels)]
+def _largest(views: list[View], extents: list[float], middle: Array) -> float:
+    """How large an object can be: as the largest of its masks that are whole, of these extents in pixels, at the depth
+    of its middle (3,), in its unit; infinite where few photos show it whole."""
+    whole = [(view, extent) for view, extent in zip(views, extents) if extent]
     if len(whole) < MIN_WHOLE_SHARE * len(views):
         return np.inf
-    sizes = []
-    for view in whole:
-        rows, columns = (np.flatnonzero(view.pixels.any(axis)) for axis in (1, 0))
-        sizes.append(np.median(view.project(own)[1]) * np.hypot(np.ptp(rows), np.ptp(columns)) / view.intrinsics[0, 0])
+    sizes = [view.project(middle[None])[1][0] * extent / view.intrinsics[0, 0] for view, extent in whole]
     return float(max(sizes, default=np.inf))
 
 
@@ -121,10 +127,12 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> NDArray[np.int8]:
     known = np.where(share >= MIN_AGREEMENT, 1, np.where(share <= 1 - MIN_AGREEMENT, -1, 0)).astype(np.int8)
     rows = [voter.rows for voter in made.values() if voter.can_vote]
     counts = np.bincount(np.concatenate([np.zeros(0, np.int64), *rows]), minlength=len(known))
-    shown = [replace(photos.views[k], pixels=voter.mask) for k, voter in made.items() if voter.can_vote]
+    shown = [k for k, voter in made.items() if voter.can_vote]
     votes, own = np.flatnonzero(known > 0), photos.points[(known > 0) & (counts >= CONFIRMING_PHOTOS)]
     if len(shown) >= CONFIRMING_PHOTOS and len(own) >= MIN_OWN_POINTS:
-        near = votes[np.linalg.norm(photos.points[votes] - np.median(own, axis=0), axis=1) <= _largest(shown, own)]
+        middle = np.median(own, axis=0)
+        largest = _largest([photos.views[k] for k in shown], [made[k].extent for k in shown], middle)
+        near = votes[np.linalg.norm(photos.points[votes] - middle, axis=1) <= largest]
         known[votes] = 0
         known[near] = 1
     own = without_outermost(photos.points[(known > 0) & (counts >= CONFIRMING_PHOTOS)])
@@ -156,20 +164,31 @@ def agrees_with_others(photos: Workspace, k: int, mask: Mask, others: dict[int, 
 
 
 def points_in_masks(photos: Workspace, masks: list[Mask]) -> Array:
-    """(N, 3) sparse points that lie in the photos' masks (H, W) wherever they are seen, without the outermost.
+    """(N, 3) sparse points that lie in the masks (H, W) of photos with RGB pixels wherever they are seen, without the
+    outermost; where an object has hardly a feature, points by coarse stereo too.
 
     Raises:
         StageError: there are fewer than ten of them.
     """
-    seen, hit = np.zeros(len(photos.points)), np.zeros(len(photos.points))
-    for rows, pixels, mask in zip(photos.seen, photos.seen_at, masks):
-        u, v = np.clip(pixels.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
-        np.add.at(seen, rows, 1)
-        np.add.at(hit, rows, mask[v, u])
-    own = photos.points[(seen >= 2) & (hit > MIN_AGREEMENT * seen)]
+    own = _in_masks(photos, masks)
+    if len(own) < MIN_OWN_POINTS:
+        # It loads PyTorch, which the page to click in does without.
+        from scenefuse.mvs.stereo_points import with_stereo_points
+
+        own = _in_masks(with_stereo_points(photos), masks)
     if len(own) < MIN_OWN_POINTS:
         raise StageError(
-            f"only {len(own)} sparse points lie in the supplied masks; "
+            f"only {len(own)} points, those by stereo included, lie in the supplied masks; "
             "are they white on the object, and of these photos?"
         )
     return without_outermost(own)
+
+
+def _in_masks(photos: Workspace, masks: list[Mask]) -> Array:
+    """(N, 3) points that lie in nearly all of the masks (H, W) of the photos that see them."""
+    seen, hit = np.zeros(len(photos.points)), np.zeros(len(photos.points))
+    for rows, pixels, mask in zip(photos.seen, photos.seen_at, masks):
+        u, v = pixel_of(pixels, mask)
+        np.add.at(seen, rows, 1)
+        np.add.at(hit, rows, mask[v, u])
+    return photos.points[(seen >= 2) & (hit > MIN_AGREEMENT * seen)]

@@ -14,7 +14,7 @@ from scenefuse.crop import marked
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.propagation import NO_CLICKS, propagate
-from scenefuse.masks.votes import known_points, voter_of
+from scenefuse.masks.votes import known_points, points_in_masks, voter_of
 from scenefuse.mvs.sparse_depths import own_points, sparse_depths
 from scenefuse.mvs.stereo_points import FEW_POINTS, with_enough_points, with_stereo, with_stereo_points
 from scenefuse.photos.views import Views
@@ -69,6 +69,13 @@ def test_stereo_adds_points_where_there_are_none_and_only_on_what_has_texture(pl
     # No place gets two.
     near = np.linalg.norm(inner[:, None] - inner[None], axis=2) + np.eye(len(inner))
     assert np.median(near.min(1)) > 0.02
+
+
+def test_an_object_without_a_feature_is_found_in_its_masks_by_points_of_stereo(plane):
+    found = points_in_masks(plane, [disc(view) & ~below(view) for view in plane.views])
+    assert len(found) > 50 and found[:, 1].min() > -0.05 and np.abs(found[:, 2]).max() < 0.2
+    with pytest.raises(StageError, match="only 0 points, those by stereo included, lie in the supplied masks"):
+        points_in_masks(plane, [np.zeros((view.height, view.width), bool) for view in plane.views])
 
 
 def test_photos_that_stereo_cannot_match_are_left_as_they_are(plane, capsys):
