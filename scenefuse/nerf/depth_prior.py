@@ -17,7 +17,7 @@ from scenefuse.core.stage import StageError, atomic_directory, quantity, threads
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.surface import ends_of
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
-from scenefuse.mvs.sparse_depths import beside_mask, own_points, pair_worth
+from scenefuse.mvs.sparse_depths import MIN_SHARED_POINTS, beside_mask, own_points, pair_worth
 from scenefuse.mvs.stereo_points import FEW_POINTS, with_enough_points
 from scenefuse.nerf.rendered_maps import MAP_AGREEMENT, confirm, write_prior
 from scenefuse.photos.views import Views, load_views
@@ -168,14 +168,14 @@ class ObjectPoints:
         ids: V arrays of the points that each photo observes on the object.
         pixels: V float32 arrays (N, 3): their column, row (pixels) and depth (object units).
         sources: (V, S) indices of the photos that each photo is matched with, best first, never held out.
-        near, far: depths between which the surface is, object units.
+        near, far: (V,) depths between which the surface is, object units.
     """
 
     ids: list[NDArray[np.int64]]
     pixels: list[NDArray[np.float32]]
     sources: NDArray[np.int64]
-    near: float
-    far: float
+    near: Array
+    far: Array
 
 
 def points_on_object(views: Views, sources: int) -> ObjectPoints:
@@ -196,29 +196,28 @@ def points_on_object(views: Views, sources: int) -> ObjectPoints:
         ids.append(rows[kept])
         pixels.append(np.column_stack([place, depth])[kept].astype(np.float32))
     on_object = np.unique(np.concatenate(ids))
-    if len(on_object) < 8:
+    if len(on_object) < MIN_SHARED_POINTS:
         raise StageError(
             f"only {len(on_object)} points lie on the object in all photos; depth needs at least 8: "
             "check that the masks show the object, and that the photos are sharp"
         )
-    closest, farthest = ends_of(np.concatenate([place[:, 2] for place in pixels]))
+    chosen = _choose_sources(views, ids, sources)
+    # Of each photo by what it and its sources observe: others may have been taken from far nearer or farther.
+    around = [np.unique(np.concatenate([ids[k] for k in (index, *others)])) for index, others in enumerate(chosen)]
+    depths = [views.view(index).visible(views.sparse[rows])[2] for index, rows in enumerate(around)]
+    every = np.concatenate(depths)
+    ends = [ends_of(depth if len(depth) >= MIN_SHARED_POINTS else every) for depth in depths]
+    closest, farthest = np.array(ends).T
     margin = RANGE_MARGIN * (farthest - closest) + 1e-3 * farthest  # a range of its own where all depths are equal
-    return ObjectPoints(
-        ids,
-        pixels,
-        _choose_sources(views, ids, sources),
-        float(max(closest - margin, 0.2 * closest)),
-        float(farthest + margin),
-    )
+    return ObjectPoints(ids, pixels, chosen, np.maximum(closest - margin, 0.2 * closest), farthest + margin)
 
 
 def _choose_sources(views: Views, seen: list[NDArray[np.int64]], count: int) -> NDArray[np.int64]:
     """For each photo the best others to match it with: many shared points, seen under good angles."""
-    centres, photos = views.object_from_cam[:, :3, 3], range(len(seen))
-    shared = [[np.intersect1d(seen[k], seen[j], assume_unique=True) for j in photos] for k in photos]
-    worth = np.array(
-        [[pair_worth(views.sparse[shared[k][j]], centres[k], centres[j])[0] for j in photos] for k in photos]
-    )
+    centres, worth = views.object_from_cam[:, :3, 3], np.full((len(seen), len(seen)), -2.0)
+    for k, j in zip(*np.triu_indices(len(seen), 1)):
+        shared = views.sparse[np.intersect1d(seen[k], seen[j], assume_unique=True)]
+        worth[k, j] = worth[j, k] = pair_worth(shared, centres[k], centres[j])[0]
     worth[:, views.held_out] = -1.0
     np.fill_diagonal(worth, -2.0)
     available = int((~views.held_out).sum()) - 1
@@ -230,9 +229,10 @@ def first_depth(views: Views, known: ObjectPoints, index: int) -> Map:
     between = _between_points(views, known, index)
     reference, *sources = (_gray(views, row) for row in (index, *known.sources[index].tolist()))
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    found = estimate_depth(reference, sources, known.near, known.far, STEREO, device)
+    near, far = float(known.near[index]), float(known.far[index])
+    found = estimate_depth(reference, sources, near, far, STEREO, device)
     score = found.score.clip(0, 1) ** 4
-    swept = 1 / found.best.clip(known.near, known.far)
+    swept = 1 / found.best.clip(near, far)
     return (1 / (between + score / (score + EVEN_SCORE**4) * (swept - between))).astype(np.float32)
 
 
@@ -243,11 +243,12 @@ def _between_points(views: Views, known: ObjectPoints, index: int) -> Array:
     if len(points) < 3:
         middle = np.median(np.concatenate([pixels[:, 2] for pixels in known.pixels]))
         points = np.array([[width / 2, height / 2, middle]], dtype=np.float32)
-    inverse = 1 / points[:, 2].astype(np.float64).clip(known.near, known.far)
+    near, far = known.near[index], known.far[index]
+    inverse = 1 / points[:, 2].astype(np.float64).clip(near, far)
     tree = cKDTree(points[:, :2])
     around = inverse[tree.query(points[:, :2], min(NEIGHBOURS, len(points)))[1].reshape(len(points), -1)]
     off = np.abs(inverse - np.median(around, axis=1))
-    keep = off <= 4.0 * np.median(off) + 0.02 * (1 / known.near - 1 / known.far)
+    keep = off <= 4.0 * np.median(off) + 0.02 * (1 / near - 1 / far)
     rows, columns = np.indices((height, width)).reshape(2, -1) + 0.5
     near_by = min(NEIGHBOURS, int(keep.sum()))
     distance, neighbour = cKDTree(points[keep, :2]).query(np.column_stack([columns, rows]), near_by)

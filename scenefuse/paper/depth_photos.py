@@ -72,8 +72,8 @@ def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhoto
         torch.as_tensor(known.sources, device=device),
         [pixels[ids % CHECK_EVERY != 0] for ids, pixels in pairs],
         [pixels[ids % CHECK_EVERY == 0] for ids, pixels in pairs],
-        known.near,
-        known.far,
+        float(known.near.min()),
+        float(known.far.max()),
         float(np.linalg.norm(high - low)),
     )
 

@@ -17,8 +17,11 @@ def _texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return (127.5 + 55.0 * np.stack([red, green, blue], -1)).astype(np.uint8)
 
 
-def plane_views(count: int = 8, width: int = 64, height: int = 48, held_out: int = 1) -> tuple[Views, np.ndarray]:
-    """A slanted textured square, z = 3 + 0.3 x in the object frame, seen by cameras along an arc; with true depths."""
+def plane_views(
+    count: int = 8, width: int = 64, height: int = 48, held_out: int = 1, distances: tuple[float, ...] = (3.0,)
+) -> tuple[Views, np.ndarray]:
+    """A slanted textured square, z = 3 + 0.3 x in the object frame, seen by cameras along an arc, in turns from these
+    distances; with true depths."""
     focal = 0.9 * width
     intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     v, u = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
@@ -27,9 +30,9 @@ def plane_views(count: int = 8, width: int = 64, height: int = 48, held_out: int
     xy = rng.uniform(-0.9, 0.9, (150, 2))
     sparse = np.column_stack([xy, 3.0 + 0.3 * xy[:, 0]])
     images, masks, poses, depths, tracks = [], [], [], [], []
-    for angle in np.linspace(-0.4, 0.4, count):
+    for row, angle in enumerate(np.linspace(-0.4, 0.4, count)):
         rotation = np.array([[math.cos(angle), 0, -math.sin(angle)], [0, 1, 0], [math.sin(angle), 0, math.cos(angle)]])
-        centre = np.array([0, 0, 3.0]) - 3.0 * rotation[:, 2]
+        centre = np.array([0, 0, 3.0]) - distances[row % len(distances)] * rotation[:, 2]
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, centre
         directions = rays @ rotation.T

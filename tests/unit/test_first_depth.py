@@ -42,6 +42,15 @@ def test_photos_without_points_have_their_depth_by_stereo():
     assert _median_error(depths, truth, views) < 0.01
 
 
+def test_photos_from_far_off_have_their_own_range_of_depths():
+    views, truth = plane_views(count=12, width=320, height=240, distances=(3.0, 15.0))
+    views = speckled(views, truth)
+    known = points_on_object(views, 4)
+    nothing = replace(known, pixels=[pixels[:0] for pixels in known.pixels[:-1]] + known.pixels[-1:])
+    far = [first_depth(views, nothing, index) for index in (3, 5)]
+    assert _median_error(np.stack(far), truth[[3, 5]], views.select(np.array([3, 5]))) < 0.03
+
+
 def test_where_stereo_finds_nothing_depth_is_between_the_points():
     views, truth = plane_views()
     blank = replace(views, images=np.full_like(views.images, 90))
