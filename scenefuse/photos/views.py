@@ -93,7 +93,8 @@ def load_views(workspace: Path, masks: Path, width_px: int, hold_out_every: int)
     shown = [k for k, matte in enumerate(mattes) if (matte.pixels > 127).any()]
     if not shown:
         raise StageError(
-            f"no photo in {workspace} has a mask in {masks}; mask files are named like their photo, with .png"
+            f"no photo in {workspace} has a mask in {masks} that is not black; mask files are named like their photo,"
+            " with .png"
         )
     read, mattes = read.subset(shown), [mattes[k] for k in shown]
     photos = [_scaled(read.rgb(view), factors[k]) for view, k in zip(read.views, shown)]
