@@ -69,25 +69,29 @@ def read_photos(workspace: Workspace, points: Array) -> Photos:
 def showing(views: list[View], points: Array, most: int) -> NDArray[np.int64]:
     """Rows of views that have points (N, 3) in their picture; of more than `most` those that cover them best."""
     sample = points[:: max(1, len(points) // 2000)]
-    shown = np.zeros((len(views), len(sample)), dtype=bool)
-    for row, view in zip(shown, views):
-        row[view.visible(sample)[0]] = True
-    rows = np.flatnonzero(shown.any(1))
+    fineness = np.zeros((len(views), len(sample)))
+    for row, view in zip(fineness, views):
+        inside, _, depth = view.visible(sample)
+        row[inside] = view.intrinsics[0, 0] / depth
+    rows = np.flatnonzero(fineness.any(1))
     if len(rows) > most:
         print(f"{most} of the {len(rows)} photos that show the object are compared", flush=True)
         centres = np.array([views[k].centre for k in rows])
-        rows = rows[covering(shown[rows], centres, sample, most)]
+        finest = np.maximum(fineness.max(0), np.finfo(np.float64).tiny)
+        rows = rows[covering(fineness[rows] / finest, centres, sample, most)]
     return rows
 
 
-def covering(shown: NDArray[np.bool_], centres: Array, points: Array, count: int) -> NDArray[np.int64]:
-    """Rows of photos, sorted, that show every point where they can, from the most different directions.
+def covering(shown: Array, centres: Array, points: Array, count: int) -> NDArray[np.int64]:
+    """Rows of photos, sorted, that show every point where they can, as finely as they can, from the most different
+    directions.
 
-    The next photo is the one of the greatest worth: the points that it shows, each divided by the square of one more
+    The next photo is the one of the greatest worth: how finely it shows points, each divided by the square of one more
     than the chosen photos that show it, times two less the cosine to the nearest of their directions.
 
     Args:
-        shown: (V, N), which photos have which points in their picture; each has one.
+        shown: (V, N), how finely each photo shows each point, over the finest one, 0 where it is not in its picture;
+            each shows one.
         centres: (V, 3) of the cameras.
         points: (N, 3).
         count: how many photos to choose.

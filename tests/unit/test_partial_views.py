@@ -12,7 +12,7 @@ from scipy import ndimage
 from scenefuse.core.transforms import Sim3
 from scenefuse.crop.marked import Masked, vote
 from scenefuse.geometry.ground import Ground
-from scenefuse.geometry.photo_check import covering, moved_view
+from scenefuse.geometry.photo_check import covering, moved_view, showing
 from scenefuse.geometry.visual_hull import Box, Hull, Outline, least_framing, mask_iou, silhouette
 from scenefuse.masks.grabcut import first_cuts
 from scenefuse.masks.segmentation import MaskSettings, score_masks
@@ -191,6 +191,20 @@ def test_photos_that_are_asked_together_have_all_of_a_facade():
     ring = [photo(f"{k}", ring_of(k, 40), (0, 0, 0.95), 65, STATUE).centre for k in range(40)]
     chosen = covering(np.ones((40, len(points)), bool), np.array(ring), np.zeros((len(points), 3)), 20)
     assert np.abs(np.subtract.outer(np.arange(40), chosen)).min(1).max() <= 1
+
+
+def test_close_ups_of_parts_are_compared_rather_than_many_photos_of_the_whole():
+    def camera(name, centre, height, degrees):
+        return photo(name, centre, (0, 0, height), degrees, [], 80, 60)
+
+    heights = (0.3, 0.75, 1.2, 1.65)
+    whole = [camera(f"a{k}", ring(k, 70, 8.0, 2.0), 0.95, 30) for k in range(70)]
+    parts = [camera(f"b{k}", ring(k, 20, 2.0, heights[k // 20]), heights[k // 20], 20) for k in range(80)]
+    chosen = showing([*whole, *parts], surface(STATUE), 64)
+    assert (chosen >= 70).mean() > 0.5
+    # A part that no close-up shows is left to the others.
+    chosen = showing([*whole, *parts[:60]], surface(STATUE), 64)
+    assert (chosen >= 70).any() and (chosen < 70).sum() > 20
 
 
 def ring_of(k, count):
