@@ -112,6 +112,11 @@ def test_a_failed_object_keeps_nobody_back_and_is_taken_in_once_it_is_mended(pro
     assert '>barn<span class="badge no">failed<' in page and "2.jpg" in page
     assert 'aria-label="3D view of scene yard"' in page
 
+    # What is there can be handed over, as `scenefuse export` does.
+    exported = ("results/summary/report.pdf", "results/summary/report.html")
+    handed = project("-n", *exported, "--allowed-rules", "make_surface", "draw_surface", "write_pdf", "write_report")
+    assert handed.returncode == 0, handed.stdout[-3000:]
+
     # As if the barn's stages had run after its photo was mended.
     shutil.copy(tmp_path / "barn/1.jpg", tmp_path / "barn/2.jpg")
     os.utime(tmp_path / "barn/2.jpg", (1e9, 1e9))

@@ -64,6 +64,18 @@ def exported_surfaces():
     return [str(path) for path in files if path.is_file()]
 
 
+def there_if_exported(pattern, **names):
+    """Input function: a file of each scene or object; of those that `scenefuse export` does not make, as of an object that failed,
+    only the ones that are there."""
+
+    def files(wildcards):
+        found = expand(pattern, **names)
+        exported = workflow.dag_settings.allowed_rules
+        return [path for path in found if Path(path).exists() or not exported]
+
+    return files
+
+
 def facade_of(name):
     """The option with the three points of an object's facade that `scenefuse export --facade` was given."""
     path = Path(f"results/objects/{name}/facade.txt")

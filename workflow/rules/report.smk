@@ -210,9 +210,9 @@ rule write_report:
     """One page with all pictures and tables, readable offline."""
     input:
         summary="results/summary/summary.txt",
-        scenes=expand("results/scenes/{scene}/scene.png", scene=SCENES),
-        views=expand("results/scenes/{scene}/view.json", scene=SCENES),
-        figures=expand("results/objects/{object}/figures", object=OBJECTS),
+        scenes=there_if_exported("results/scenes/{scene}/scene.png", scene=SCENES),
+        views=there_if_exported("results/scenes/{scene}/view.json", scene=SCENES),
+        figures=there_if_exported("results/objects/{object}/figures", object=OBJECTS),
         paper=PAPER,
         surfaces=lambda wildcards: exported_surfaces(),
     output:
@@ -242,12 +242,12 @@ rule write_pdf:
     """The same on paper; `scenefuse export` asks for it."""
     input:
         summary="results/summary/summary.txt",
-        scenes=expand("results/scenes/{scene}/scene.png", scene=SCENES),
-        figures=expand("results/objects/{object}/figures", object=OBJECTS),
+        scenes=there_if_exported("results/scenes/{scene}/scene.png", scene=SCENES),
+        figures=there_if_exported("results/objects/{object}/figures", object=OBJECTS),
         drawings=[
             f"results/objects/{name}/drawings"
             for name in OBJECTS
-            if Path(f"results/objects/{name}/fused.ply").is_file()
+            if is_added(Path(f"results/objects/{name}"))
         ],
     output:
         "results/summary/report.pdf",
