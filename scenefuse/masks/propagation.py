@@ -108,8 +108,8 @@ def propagate(
 
     make_all()
     if not any(voter.can_vote for voter in made.values()):
-        best = max(made, key=lambda k: made[k].agreement)
-        if made[best].agreement <= 0:
+        best = max(made, key=lambda k: (made[k].quality > 0, made[k].agreement))
+        if made[best].quality == 0 or made[best].agreement <= 0:
             _refuse(photos, made, left_out)
         made[best].only = True
         notes.append(
@@ -290,6 +290,7 @@ def _refuse(photos: Workspace, made: dict[int, Voter], left_out: dict[int, list[
     """Say why no photo has a mask to begin with."""
     about = "; ".join(
         f"{photos.views[k].name}: agreement with the clicks {voter.agreement:.2f} (least {MIN_AGREEMENT})"
+        f"{'' if voter.quality else ', the mask empty or all of the photo'}"
         for k, voter in made.items()
     )
     wrong = "".join(f"; {note}" for notes in left_out.values() for note in notes)

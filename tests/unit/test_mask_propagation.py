@@ -1,6 +1,7 @@
 """Masks from clicks in one photo: a planted ball, sparse points on it and around it, photos on a circle."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -137,6 +138,13 @@ def test_contradictory_clicks_are_named_all_at_once_and_left_out(photos):
 def test_too_few_clicks_left_is_an_error_that_names_them(photos):
     with pytest.raises(StageError, match=r"no clicked photo has a good mask .*f03\.png: agreement .*\(100, 45\)"):
         propagate(PlantedNetwork(), photos, {3: clicks([(100, 45), (10, 10)])}, 2)
+
+
+def test_an_object_that_fills_its_only_clicked_photo_is_named_where_grabcut_sees_nothing_else():
+    photos = photos_of_a_ball()
+    whole = clicks([MIDDLE, (50, 40), (70, 50)], box=[[0, 0], [WIDTH, HEIGHT]])
+    with pytest.raises(StageError, match=r"f00\.png: agreement .*, the mask empty or all of the photo\)"):
+        propagate(partial(query_grabcut, WIDTH), photos, {0: whole}, 4)
 
 
 def test_a_mask_that_agrees_with_some_clicks_only_is_used_and_said_where_there_is_no_better(photos):
