@@ -278,7 +278,7 @@ def check_marks(path: Path, photos: Mapping[str, Path] | None = None, used: list
         return
     names = list(photos) if used is None else used
     sizes: dict[str, tuple[int, int]] = {}
-    for click in in_photos(marked.rows, photos, path):
+    for click, written in zip(in_photos(marked.rows, photos, path), marked.rows):
         photo = click.photo
         if photo not in photos:
             raise StageError(
@@ -293,4 +293,8 @@ def check_marks(path: Path, photos: Mapping[str, Path] | None = None, used: list
             )
         if photo not in sizes:
             sizes[photo] = upright_size(photos[photo])
+        # A copy in another folder, which is left out.
+        named = next((f for up in photos[photo].parents if (f := up / written.photo).is_file()), photos[photo])
+        if named != photos[photo] and upright_size(named) != sizes[photo]:
+            raise StageError(f"{path}: {click} is in {written.photo}, a smaller copy of {photo}; click in that one")
         check_inside(path, click, sizes[photo])

@@ -247,6 +247,19 @@ def test_clicks_in_photos_that_will_not_be_there_are_named_before_anything_runs(
         check_marks(path, photos)
 
 
+def test_a_click_in_a_smaller_copy_that_is_left_out_is_not_taken_for_one_in_its_original(tmp_path):
+    for name, size in (("p/1.jpg", (40, 30)), ("p/web/1.jpg", (20, 15)), ("p/same/1.jpg", (40, 30))):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", size).save(tmp_path / name)
+    photos, path = {"1.jpg": tmp_path / "p/1.jpg"}, tmp_path / "clicks.tsv"
+    for name in ("1.jpg", "p/1.jpg", "same/1.jpg"):
+        path.write_text(f"{LABELS}inside\t{name}\t9\t9\n")
+        check_marks(path, photos)
+    path.write_text(f"{LABELS}inside\tweb/1.jpg\t9\t9\n")
+    with pytest.raises(StageError, match=r"at \(9, 9\) is in web/1.jpg, a smaller copy of 1.jpg; click in that one"):
+        check_marks(path, photos)
+
+
 @pytest.mark.parametrize(
     ("rows", "sentence"),
     [
