@@ -111,7 +111,10 @@ def _scene_sheet(
         for number, color in enumerate(OVERLAP_COLORS):
             label = f"{number}" + (" or more" if number == most else "")
             sheet.axes[3].plot([], [], "s", color=color / 255, label=label)
-        sheet.axes[3].legend(loc="lower center", ncols=most + 1, handletextpad=0, columnspacing=0.4, fontsize="x-small")
+        sheet.axes[3].legend(
+            loc="upper center", bbox_to_anchor=(0.5, 0.0), borderpad=0.2, frameon=False,
+            ncols=most + 1, handletextpad=0, columnspacing=0.4, fontsize="x-small",
+        )  # fmt: skip
         _draw_errors(sheet.axes[2], above, {view.name: view.centre for view in views}, errors)
     for axes in sheet.axes[: 3 if views else 1 : 2]:
         draw_scale(axes, above.focal_px, *place)
@@ -139,8 +142,9 @@ def _draw_errors(axes: Any, camera: Camera, centres: dict[str, Array], errors: p
     shapes.set_array(errors.up_m.fillna(0.0).to_numpy())
     axes.add_collection(shapes)
     axes.scatter(*pixels.T, s=2, c="black", zorder=4)
-    scale = axes.figure.colorbar(shapes, cax=axes.inset_axes((0.7, 0.17, 0.25, 0.025)), orientation="horizontal")
-    scale.set_label("above GPS (m)")
+    scale = axes.figure.colorbar(shapes, cax=axes.inset_axes((0.5, -0.03, 0.4, 0.02)), orientation="horizontal")
+    scale.ax.tick_params(labelsize="x-small", pad=1)
+    axes.text(0.46, -0.02, "above GPS (m)", fontsize="small", ha="right", va="center", transform=axes.transAxes)
     axes.set_title(f"{axes.get_title()}: east, north × {factor:,.3g}", fontsize="medium", pad=3)
 
 

@@ -70,6 +70,7 @@ class _Page(FPDF):
         self.add_font("sans", "", fonts / "DejaVuSans.ttf")
         self.add_font("sans", "B", fonts / "DejaVuSans-Bold.ttf")
         self.project, self.made = project, made
+        self.c_margin = 0.0
         self.set_title(project)
         self.set_creator(f"scenefuse {VERSION}")
 
@@ -152,8 +153,8 @@ class _Page(FPDF):
             x = self.l_margin + k % 2 * (cell + GAP_MM)
             y = top + k // 2 * (height * per_unit + 2 * GAP_MM)
             high, wide = (side_px * pixel * per_unit for side_px in pixels.shape[:2])
-            self.set_fill_color(217)  # as on the drawings: a wall may be white
-            self.rect(x, y, wide, high, "F")
+            with self.local_context(fill_color=217):  # as on the drawings: a wall may be white
+                self.rect(x, y, wide, high, "F")
             self.image(Image.fromarray(pixels), x, y, wide)
             self.text(x, y + height * per_unit + 3, f"from the {side}")
         bar = round_below(width / 2)
