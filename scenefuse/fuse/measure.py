@@ -73,7 +73,7 @@ def measure_again(known: Measured, photos: Photos, diagonal: float) -> tuple[Mea
 
     Each point has the matches of the photos that confirm it more often, and the smaller standard deviation. Photos
     dispute a point where they resolve more than those before, enough of them were compared there and show texture, and
-    they do not confirm it.
+    they do not confirm it, or less than half of them: beside an edge three of ten match by chance.
     """
     one, two = known.matches, match_in(known.cloud.points, known.cloud.normals, photos)
     more = two.photos > one.photos
@@ -82,7 +82,8 @@ def measure_again(known: Measured, photos: Photos, diagonal: float) -> tuple[Mea
     } | {"match": np.maximum(one.match, two.match), "deviation": np.minimum(one.deviation, two.deviation)})  # fmt: skip
     surface = supported(known.cloud.points, one.measured | two.measured, diagonal)
     compared = (two.tested >= CONFIRMING_PHOTOS) & two.textured & (two.step < one.step)
-    return Measured(known.cloud, best, surface), compared & ~two.measured
+    agree = two.photos >= SUPPORT * (two.tested + 1)
+    return Measured(known.cloud, best, surface), compared & ~(two.measured & agree)
 
 
 def supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> NDArray[np.bool_]:

@@ -27,6 +27,8 @@ from scenefuse.photos.workspace import View, Workspace, read_model
 # As MAX_WRONG_SHARE, for GrabCut's first masks, and for another hull by which masks are compared: where many lack a
 # part, they would carve it away.
 MAX_LACKING_SHARE = 0.34
+# Times that masks are made again by the hull of those before: each brings a better hull, the last ones little.
+MAX_ROUNDS = 3
 # Share of the median mask's agreement with the hull below which SAM 2 makes a mask once more.
 MIN_SHARE_OF_MEDIAN = 0.9
 NOTHING: Mapping[int, PhotoClicks] = {}
@@ -104,25 +106,30 @@ def segment_again(
     votes: NDArray[np.int8] | None = None,
 ) -> list[Mask]:
     """SAM 2 once more, by what the other photos say and the photo's own clicks, where one of the masks (H, W) disagrees
-    with the hull, or much more than most, unless clicks alone suffice for it; then all at the photo's resolution.
+    with the hull, or much more than most, unless clicks alone suffice for it; again with the hull of the masks that
+    this changed, and then all at the photo's resolution.
 
     A mask that holds points of something else, by the `votes` (P,) of the first masks, as of a tree before a wall, is
     not taken.
     """
     masks = list(masks)
-    hull = carve_consistent(target, photos.views, masks, settings, MAX_WRONG_SHARE)
-    outlines = [silhouette(hull, view) for view in photos.views]
-    agreement = [mask_iou(mask, outline) for mask, outline in zip(masks, outlines)]
-    least = max(settings.min_agreement, MIN_SHARE_OF_MEDIAN * float(np.median(agreement)))
-    for k, (view, outline) in enumerate(zip(photos.views, outlines)):
-        final = masks[k].any() and k in clicked and clicked[k].enough
-        if outline.any() and agreement[k] < least and not final:
-            again = segment_like(network, target, view, outline, clicked.get(k, NO_CLICKS))
-            held = np.zeros(0) if votes is None else votes[points_held(photos, k, again)]
-            foreign = np.count_nonzero(held) >= MIN_KNOWN_POINTS and np.mean(held[held != 0] > 0) < MIN_AGREEMENT
-            if mask_iou(again, outline) > agreement[k] and not foreign:
-                masks[k] = again
-            print(f"{view.name} segmented again, IoU {mask_iou(masks[k], outline):.2f}", flush=True)
+    for _ in range(MAX_ROUNDS):
+        hull = carve_consistent(target, photos.views, masks, settings, MAX_WRONG_SHARE)
+        outlines = [silhouette(hull, view) for view in photos.views]
+        agreement = [mask_iou(mask, outline) for mask, outline in zip(masks, outlines)]
+        least = max(settings.min_agreement, MIN_SHARE_OF_MEDIAN * float(np.median(agreement)))
+        changed = False
+        for k, (view, outline) in enumerate(zip(photos.views, outlines)):
+            final = masks[k].any() and k in clicked and clicked[k].enough
+            if outline.any() and agreement[k] < least and not final:
+                again = segment_like(network, target, view, outline, clicked.get(k, NO_CLICKS))
+                held = np.zeros(0) if votes is None else votes[points_held(photos, k, again)]
+                foreign = np.count_nonzero(held) >= MIN_KNOWN_POINTS and np.mean(held[held != 0] > 0) < MIN_AGREEMENT
+                if mask_iou(again, outline) > agreement[k] and not foreign:
+                    masks[k], changed = again, True
+                print(f"{view.name} segmented again, IoU {mask_iou(masks[k], outline):.2f}", flush=True)
+        if not changed:
+            break
     return [_at_full_size(view, mask) for view, mask in zip(photos.views, masks)]
 
 

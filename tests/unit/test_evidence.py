@@ -10,7 +10,7 @@ from support.photographed_plane import BLANK, photographs
 from scenefuse.cloud.clouds import Cloud, concatenate
 from scenefuse.core.stage import value
 from scenefuse.core.transforms import Sim3
-from scenefuse.fuse import compare, modes
+from scenefuse.fuse import compare, measure, modes
 from scenefuse.fuse.compare import Reason, better_measured
 from scenefuse.fuse.fuse_object import evidence_report
 from scenefuse.fuse.measure import FIELDS, Evidence, Measured, deviations_of_pose
@@ -112,6 +112,17 @@ def test_what_close_ups_show_and_do_not_confirm_beside_the_object_goes_though_th
     assert (found.scene.fields["evidence"][last & gone] == Evidence.MEASURED).mean() > 0.8
     # Photos that resolve no more than the scene's own dispute nothing.
     assert not (check(obj, scene, flight, near, nerf_only=False).reason == Reason.DISPUTED).any()
+
+
+def test_fewer_than_half_of_the_close_ups_that_are_compared_confirm_nothing(monkeypatch):
+    """Of ten photos three match beside an edge by chance."""
+    cloud, ones = sheet(0.0, 0.3, 0.1, half=0.1), np.ones(4)
+    cloud = cloud[:4]
+    coarse = Matches(ones, ones, np.full(4, 5), np.full(4, 6), 0.1 * ones, 20 * ones, ones)
+    fine = replace(coarse, photos=np.array([3, 5, 6, 3]), tested=np.array([10, 10, 10, 4]), step=0.5 * ones)
+    monkeypatch.setattr(measure, "match_in", lambda *_: fine)
+    known = measure.Measured(cloud, coarse, np.ones(4, dtype=bool))
+    assert measure.measure_again(known, pack([]), 1.0)[1].tolist() == [True, True, False, False]
 
 
 def test_what_the_scene_measured_goes_only_where_something_is_left_beside_it(near, far, monkeypatch):

@@ -21,12 +21,14 @@ from support.planted_ball import (
 
 from scenefuse.core.stage import StageError
 from scenefuse.geometry.visual_hull import mask_iou
+from scenefuse.masks import segmentation
 from scenefuse.masks.grabcut import along_edges, grow_seeds, query_grabcut
 from scenefuse.masks.prompts import NO_PIXELS, Prompts, far_apart, overlap
 from scenefuse.masks.propagation import NO_CLICKS, best_mask, one_photo, propagate
 from scenefuse.masks.sam2 import query_sam2
 from scenefuse.masks.segmentation import (
     MaskSettings,
+    carve_consistent,
     score_masks,
     segment_again,
     segment_by_grabcut,
@@ -469,6 +471,22 @@ def test_a_mask_made_again_is_not_taken_where_it_holds_what_other_masks_leave_ou
         votes = np.full(len(photos.points), vote, np.int8)
         again = segment_again(BallNetwork(photos), of_points(photos), masks, photos, COARSE, votes=votes)
         assert again[8].any() == taken
+
+
+def test_masks_are_made_again_by_the_hull_of_those_that_were_made_again(photos, monkeypatch):
+    rounds = []
+
+    def carved(target, views, masks, settings, tolerance):
+        rounds.append([mask.any() for mask in masks])
+        return carve_consistent(target, views, masks, settings, tolerance)
+
+    monkeypatch.setattr(segmentation, "carve_consistent", carved)
+    masks = [true_mask(view) for view in photos.views]
+    segment_again(BallNetwork(photos), of_points(photos), masks, photos, COARSE)
+    assert len(rounds) == 1  # nothing to make again
+    masks[8] = np.zeros_like(masks[8])
+    segment_again(BallNetwork(photos), of_points(photos), masks, photos, COARSE)
+    assert len(rounds) == 3 and not rounds[1][8] and rounds[2][8]
 
 
 def test_a_part_with_the_background_s_colour_is_found_from_a_click_by_the_edge_around_it():
