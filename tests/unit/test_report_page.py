@@ -360,7 +360,7 @@ QUESTIONS = {
     "where is the file?": r"objects/\s*house/\s*fused\.ply",
     "what next?": "photograph it from 4 places",
     "who made it?": r"Made with scenefuse \d.* on 20\d\d-\S+ by Hof Müller",
-    "which frame?": r"with its surroundings \(local frame, metres\)",
+    "which frame?": r"with its surroundings \(local frame, metres; for CloudCompare\)",
     "what is that beside the GPS?": r"on Earth as exact as the scene \(see Position\)",
 }
 SHOWN = """
