@@ -180,16 +180,18 @@ def photo_rows(
     rows, unit = [], unit.replace(" ", "_")
     for number, station in enumerate(plan.stations, 1):
         for view in station.photos:
-            ahead = view.cam_from_world[2, :3]
+            east, north, up = view.cam_from_world[2, :3]
             row: dict[str, Any] = {"station": number, "photo": int(view.name)}
             if frame is not None and has_place(frame.crs):
-                latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
+                there = frame.inverse(np.stack([view.centre, view.centre + [east, north, 0]]))
+                latitude, longitude, altitude = there[0]
+                north, east = (there[1] - there[0])[:2] * [1, np.cos(np.radians(latitude))]
                 row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
                 row |= {"altitude_m": round(altitude + gps_higher, 3)} if np.isfinite(gps_higher) else {}
             row[f"above_foot_{unit}"] = float(f"{view.centre[2] - foot:.4g}")
-            row["heading_deg"] = round(float(np.degrees(np.arctan2(ahead[0], ahead[1]))) % 360, 1)
-            row |= {} if frame is None else {"looking": compass(row["heading_deg"])}
-            row["pitch_deg"] = round(float(np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))), 1)
+            row["heading_deg"] = round(float(np.degrees(np.arctan2(east, north))) % 360, 1)
+            row |= {"looking": compass(row["heading_deg"])} if frame is not None and frame.crs is not None else {}
+            row["pitch_deg"] = round(float(np.degrees(np.arcsin(np.clip(up, -1, 1)))), 1)
             # Said once: the three photos show it together.
             row["station_shows_percent_of_missing"] = round(100 * station.shows, 1) if view is station.photos[0] else ""
             rows.append(row | {f"local_{axis}_{unit}": float(f"{at:.7g}") for axis, at in zip("xyz", view.centre)})

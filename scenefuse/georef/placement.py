@@ -125,6 +125,8 @@ def place_by_control(
             f"{where}: only {inliers.sum()} of {len(rows)} control points agree with the model within {limit:.2g} m;"
             " check their coordinates, whether x is easting and y northing, and where each was clicked"
         )
+    agree = whole & inliers
+    check_spread(there[agree], [n for n, a in zip(names, agree) if a], where)
     if fitted.rotate(up)[2] < 0:
         raise StageError(
             f"{where}: the control points turn the model upside down, as swapped axes do; x has to be easting or"
@@ -177,8 +179,9 @@ def beside_gps(
             f"{where}: the control points lie {np.linalg.norm(shift[:2]) / 1000:.3g} km from where GPS saw the cameras;"
             " correct their CRS or swapped axes, or switch use_gps off if GPS is wrong"
         )
-    limit = _limit(float(np.median(gps.sd_m[:, 0])), _extent(target)[0], settings)
-    inliers = np.sqrt(np.nansum((difference - shift) ** 2, axis=1)) <= limit
+    accuracy_m, extent = float(np.median(gps.sd_m[:, 0])), _extent(target)[0]
+    inliers = np.sqrt(np.nansum((difference - shift) ** 2, axis=1)) <= _limit(accuracy_m, extent, settings)
+    inliers &= _tells_scale(extent, accuracy_m)
     if not inliers.any():
         return replace(placement, inliers=inliers, gps_shift=shift)
     start = [np.array([s.x_in_model for s, u in zip(located, points) if u]), gps.centres[inliers]]
@@ -207,6 +210,11 @@ def _limit(sd_m: float, extent: float, settings: GeoreferenceSettings) -> float:
     return max(MAX_DEVIATIONS * sd_m, min(MAX_DEVIATIONS * settings.gps_accuracy_m, MAX_BENT * extent))
 
 
+def _tells_scale(extent: float, accuracy_m: float) -> bool:
+    """Whether positions spread so far that they say more than where they are."""
+    return bool(extent >= MAX_DEVIATIONS * accuracy_m)
+
+
 def middle_of(difference: Array) -> Array:
     """(3,) medians of (N, 3) differences; 0 where none is known."""
     known = np.isfinite(difference)
@@ -232,7 +240,7 @@ def place_by_gps(
     """
     accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target)
     limit = _limit(accuracy_m, extent[0], settings)
-    if extent[0] < MAX_DEVIATIONS * accuracy_m:
+    if not _tells_scale(extent[0], accuracy_m):
         reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {accuracy_m:g} m"
         return upright(up, reason)
     fitted, inliers, levelled = _fit(centres, target, up, accuracy_m, limit, seed, sure_up)
@@ -241,7 +249,7 @@ def place_by_gps(
         return upright(up, reason)
     reason = f"{inliers.sum()} of {len(target)} photos by GPS"
     if levelled:
-        line = "along one line, " if _extent(target[inliers])[1] < MAX_DEVIATIONS * accuracy_m else ""
+        line = "along one line, " if not _tells_scale(_extent(target[inliers])[1], accuracy_m) else ""
         reason += f", {line}levelled by the cameras"
     unknown = np.isnan(target[:, 2])
     if unknown.all():
@@ -258,7 +266,7 @@ def _fit(
     has_height = np.isfinite(target[:, 2])
 
     def fixes_tilt(rows: NDArray[np.bool_]) -> bool:
-        return bool(rows.sum() >= PHOTOS_OF_ONE_ERROR and _extent(target[rows])[1] >= MAX_DEVIATIONS * accuracy_m)
+        return bool(rows.sum() >= PHOTOS_OF_ONE_ERROR and _tells_scale(_extent(target[rows])[1], accuracy_m))
 
     def leans(fitted: Sim3, rows: NDArray[np.bool_]) -> bool:
         lean = np.degrees(np.arccos(np.clip(fitted.rotate(up)[2] / np.linalg.norm(up), -1, 1)))

@@ -91,7 +91,7 @@ def write_residuals(path: Path, found: Georeference, left: Residuals) -> None:
         chosen = found.placement.inliers if len(found.placement.inliers) else np.zeros(len(found.gps.names), bool)
         for name, is_used, error, sd_m in zip(found.gps.names, chosen, left.cameras, found.gps.sd_m):
             rows.append(["position", name, yes_no[bool(is_used)], _length(error), *error, *sd_m])
-    table = pd.DataFrame(rows, columns=COLUMNS[: max(map(len, rows), default=0)]).reindex(columns=COLUMNS)
+    table = pd.DataFrame([dict(zip(COLUMNS, row)) for row in rows], columns=COLUMNS)
     with atomic_file(path) as temporary:
         table.astype({"photos": "Int64"}).to_csv(temporary, sep="\t", index=False, float_format="%.4f")
 
@@ -178,14 +178,17 @@ def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str
     worst = [k for k in np.argsort(-ratio) if ratio[k] > MAX_DEVIATIONS]
     if not worst:
         return []
-    named = [
-        "{} ({:+.2f} east, {:+.2f} north, {:+.2f} up)".format(control.located[k].point.name, *left.points[k])
-        for k in worst[:3]
-    ]
+    named = [f"{control.located[k].point.name} ({_in_words(left.points[k])})" for k in worst[:3]]
     return [
         f"{len(worst)} of {used.sum()} control points are more than {MAX_DEVIATIONS:g} stated standard deviations off,"
         f" in metres: {', '.join(named)}; correct coordinates and clicks, or state larger deviations in columns 8 and 9"
     ]
+
+
+def _in_words(error: Array) -> str:
+    """The known coordinates of an error (3,)."""
+    named = zip(error, ("east", "north", "up"))
+    return ", ".join(f"{off:+.2f} {axis}" for off, axis in named if np.isfinite(off))
 
 
 def _of_cameras(found: Georeference, left: Residuals) -> dict[str, Any]:

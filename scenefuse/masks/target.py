@@ -70,7 +70,12 @@ def target_from_points(points: Array, photos: Workspace, up: Array, seed: int) -
         photos: cameras, sparse points, and who observes them.
         up: (3,) the direction against gravity.
         seed: seed of the ground's RANSAC.
+
+    Raises:
+        StageError: all points lie in one place.
     """
+    if not np.ptp(points, axis=0).any():
+        raise StageError("the points clicked on the object lie in one place; click some that span it")
     sparse, box = photos.points, upright_box(points, up, MAX_BEYOND_POINTS)
     x_in_box = box.to_box(sparse)
     ground, found = find_ground(x_in_box, box, box.to_box(points), seed)

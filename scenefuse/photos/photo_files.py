@@ -137,7 +137,7 @@ def photo_files(folder: Path) -> list[Path]:
 
 def distinct_photos(folder: Path) -> tuple[list[str], list[str]]:
     """Relative names of the photos below a folder (`photo_files`), sorted, of which none is another's file again, byte
-    for byte or in fewer pixels; and notes that name pictures that were left out.
+    for byte, in fewer pixels or edited; and notes that name pictures that were left out.
 
     A copy sees nothing that its original does not, but would count as one more photo that confirms it. The shortest
     name stays.
@@ -162,18 +162,19 @@ def distinct_photos(folder: Path) -> tuple[list[str], list[str]]:
             first = kept.setdefault(sha256(folder / name), name)
             if first != name:
                 first_of[name] = first
-    smaller = _smaller_copies(folder, [name for name in names if name not in first_of])
-    for found, how in ((first_of, "copies of others, byte for byte,"), (smaller, "smaller copies of the same shots")):
+    others = _other_copies(folder, [name for name in names if name not in first_of])
+    for found, how in ((first_of, "copies of others, byte for byte,"), (others, "other copies of the same shots")):
         if found:
             one = f"{(copy := min(found))} of {found[copy]}"
             notes.append(f"{len(found)} photos are {how} and are left out ({one})")
-    return [name for name in names if name not in first_of | smaller], notes
+    return [name for name in names if name not in first_of | others], notes
 
 
-def _smaller_copies(folder: Path, names: list[str]) -> dict[str, str]:
+def _other_copies(folder: Path, names: list[str]) -> dict[str, str]:
     """Photos of which another folder holds the same shot, by its name, time and camera, in more pixels; and that one.
 
-    Cameras of a rig may agree in all that, but in the number of pixels too.
+    Cameras of a rig may agree in all that, but in the number of pixels too: of as many, only a camera's serial number
+    tells an edited copy from another photo.
     """
     from PIL.ExifTags import IFD, Base
 
@@ -183,15 +184,20 @@ def _smaller_copies(folder: Path, names: list[str]) -> dict[str, str]:
     for alike in (group for group in by_name.values() if len(group) > 1):
         largest = dict[tuple[str, ...], tuple[int, str]]()
         pixels = dict[str, tuple[int, tuple[str, ...]]]()
-        for name in alike:
+        for name in sorted(alike, key=len):
             with suppress(StageError), open_picture(folder / name) as image:
                 exif = image.getexif()
                 taken = exif.get_ifd(IFD.Exif)
                 if when := taken.get(Base.DateTimeOriginal):
-                    shot = (str(when), str(taken.get(Base.SubsecTimeOriginal)), str(exif.get(Base.Model)))
+                    own = exif.get(Base.Model), taken.get(Base.BodySerialNumber, "")
+                    shot = tuple(map(str, (when, taken.get(Base.SubsecTimeOriginal), *own)))
                     pixels[name] = image.width * image.height, shot
-                    largest[shot] = max(largest.get(shot, (0, "")), (pixels[name][0], name))
-        found |= {name: largest[shot][1] for name, (count, shot) in pixels.items() if count < largest[shot][0]}
+                    if pixels[name][0] > largest.get(shot, (0, ""))[0]:
+                        largest[shot] = pixels[name][0], name
+        for name, (count, shot) in pixels.items():
+            most, first = largest[shot]
+            if count < most or (shot[-1] and name != first):
+                found[name] = first
     return found
 
 

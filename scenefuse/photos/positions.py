@@ -52,8 +52,8 @@ class Position:
 
 
 def stated_position(gps: Mapping[int, Any], xmp: bytes) -> tuple[Position, str]:
-    """Where a photo was taken by EXIF's GPS block, or by XMP where that has none; and why there is no position, or what
-    was assumed of it, "" for nothing.
+    """Where a photo was taken by EXIF's GPS block, or by XMP where that has none, and its accuracy, by XMP first; and
+    why there is no position, or what was assumed of it, "" for nothing.
 
     Degrees may be three numbers, fewer, one with decimals, or text; signed, with a reference, or both, which then count
     once; zero denominators are numbers that are missing.
@@ -67,7 +67,8 @@ def stated_position(gps: Mapping[int, Any], xmp: bytes) -> tuple[Position, str]:
             place, problem = degrees_of(north, north_of, east, east_of)
             if place is not None:
                 height = next((metres for metres in heights if metres is not None), None)
-                return Position(*place, height, *rtk_accuracy(xmp)), problem
+                horizontal, vertical = rtk_accuracy(xmp)
+                return Position(*place, height, horizontal or _positive(gps.get(31)), vertical), problem
             problems.append(problem)
         heights.reverse()  # a height is best that of the position
     return Position(), problems[0] if problems else ""
@@ -141,10 +142,10 @@ def exif_text(value: Any) -> str:
 
 def rtk_accuracy(xmp: bytes) -> tuple[float | None, float | None]:
     """Standard deviations (m) of a photo's position, horizontal (of one axis) and vertical, that its XMP states."""
-    east, north, up = (_positive(pattern, xmp) for pattern in (EAST, NORTH, UP))
+    east, north, up = (_positive(_first(pattern, xmp)) for pattern in (EAST, NORTH, UP))
     if east is not None and north is not None:
         return float(np.sqrt((east**2 + north**2) / 2)), up
-    return _positive(HORIZONTAL, xmp), _positive(VERTICAL, xmp)
+    return _positive(_first(HORIZONTAL, xmp)), _positive(_first(VERTICAL, xmp))
 
 
 def _first(pattern: re.Pattern[bytes], xmp: bytes) -> bytes | None:
@@ -153,9 +154,9 @@ def _first(pattern: re.Pattern[bytes], xmp: bytes) -> bytes | None:
     return None if found is None else found[1]
 
 
-def _positive(pattern: re.Pattern[bytes], xmp: bytes) -> float | None:
-    """A positive number in XMP, or None."""
-    number = next(iter(_parts(_first(pattern, xmp) or b"")), None)
+def _positive(value: Any) -> float | None:
+    """A positive number of EXIF or XMP, or None."""
+    number = next(iter(_parts(value)), None)
     return number if number is not None and number > 0 else None
 
 

@@ -247,6 +247,8 @@ def alike_pairs(features: Path, count: int) -> list[Pair]:
     a photo, how its descriptors lie about their nearest of a few mean ones."""
     with pycolmap.Database.open(features) as opened:
         images = [i for i in opened.read_all_images() if opened.num_descriptors_for_image(i.image_id)]
+        if not images:
+            return []
 
         def descriptors(image: pycolmap.Image) -> NDArray[np.float32]:
             return np.asarray(opened.read_descriptors(image.image_id).data, np.float32)

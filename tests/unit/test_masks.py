@@ -443,6 +443,11 @@ def test_points_that_are_not_exact_give_the_box_but_no_prompt(capture, monkeypat
     assert all((box == asked[0][1]).all() for _, box in asked)
 
 
+def test_points_in_one_place_are_refused(capture):
+    with pytest.raises(StageError, match="lie in one place"):
+        target_from_points(np.ones((3, 3)), read_workspace(capture / "undistorted"), np.array([0, 0, 1.0]), 0)
+
+
 def test_a_mask_is_made_again_from_the_box_of_its_outline_and_a_few_points_in_its_middle(capture):
     asked, outline = [], np.zeros((HEIGHT, WIDTH), dtype=bool)
 

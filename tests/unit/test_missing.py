@@ -6,17 +6,18 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pyproj
 import pytest
 from support.changed_scene import write_changes
 from support.painted_sphere import CENTER, RADIUS, sphere_views
 
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import Sim3, look_at
 from scenefuse.fuse.find_missing import POSITION, MissingInputs, MissingOutputs, find_missing, photo_rows
-from scenefuse.fuse.missing import Lack, Plan, find_missing_surface, plan_stations
+from scenefuse.fuse.missing import Lack, Plan, Station, find_missing_surface, plan_stations
 from scenefuse.geometry.photo_check import pack
-from scenefuse.photos.geodesy import LocalFrame
+from scenefuse.photos.geodesy import GridFrame, LocalFrame
 from scenefuse.photos.workspace import View, write_model
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -181,6 +182,21 @@ def test_rows_say_where_to_stand_and_where_to_look(half):
     # GPS may count heights from another zero than the scene does.
     higher = photo_rows(plan, 0.0, frame, gps_higher=47.0)
     assert {round(b["altitude_m"] - a["altitude_m"], 2) for a, b in zip(rows, higher)} == {47.0}
+
+
+@pytest.mark.parametrize("crs", ["EPSG:2048", "EPSG:32734", "EPSG:3031"])
+def test_headings_count_from_north_wherever_the_axes_of_the_crs_point(crs):
+    to_crs = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    place = 19.0, -75.0 if crs == "EPSG:3031" else -33.0
+    eye, north_east = (np.array([*to_crs.transform(*at), 0.0]) for at in (place, np.add(place, [1e-5, 1e-5])))
+    pose = np.eye(4)
+    pose[:3, :3] = look_at(np.zeros(3), north_east - eye, UP)
+    plan = Plan([Station([View("1", np.eye(3), pose, 9, 9)], 1.0)], 1.0)
+    (row,) = photo_rows(plan, 0.0, GridFrame(crs, eye))
+    wanted = np.degrees(np.arctan(np.cos(np.radians(place[1]))))
+    assert row["heading_deg"] == pytest.approx(wanted, abs=0.3)
+    assert row["looking"] == ("north" if crs == "EPSG:3031" else "north-east")
+    assert "looking" not in photo_rows(plan, 0.0, GridFrame(None, eye))[0]
 
 
 def test_an_object_of_which_nothing_came_into_the_scene_is_missing_as_a_whole(half):

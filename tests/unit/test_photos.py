@@ -108,10 +108,10 @@ def test_rotated_photos_are_stood_upright_and_the_others_linked(tmp_path):
     assert value(read_json(tmp_path / "photos.json"), "turned") == {"sub/b.jpg": 6}
 
 
-def test_smaller_copies_of_a_shot_are_left_out_and_photos_of_a_rig_stay(tmp_path):
-    def shot(name, size, when="2026:05:01 12:00:00"):
+def test_smaller_and_edited_copies_of_a_shot_are_left_out_and_photos_of_a_rig_stay(tmp_path):
+    def shot(name, size, when="2026:05:01 12:00:00", serial=""):
         exif = Image.Exif()
-        exif[0x0110], exif[0x8769] = "Camera", {0x9003: when} if when else {}
+        exif[0x0110], exif[0x8769] = "Camera", {0x9003: when, 0xA431: serial} if when else {}
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", size, (0, len(name), size[0])).save(tmp_path / name, exif=exif)
 
@@ -120,10 +120,12 @@ def test_smaller_copies_of_a_shot_are_left_out_and_photos_of_a_rig_stay(tmp_path
     shot("p/right/2.jpg", (40, 30))
     shot("p/later/1.jpg", (20, 15), "2026:05:01 12:00:09")
     shot("p/undated/1.jpg", (20, 15), "")
+    for name, serial in (("left/3.jpg", "A7"), ("left/edited/3.jpg", "A7"), ("right/3.jpg", "B2")):
+        shot(f"p/{name}", (40, 30), serial=serial)
     names = [photo.name for photo in listed(tmp_path, tmp_path / "p")]
-    assert names == ["1.JPG", "later/1.jpg", "left/2.jpg", "right/2.jpg", "undated/1.jpg"]
+    assert " ".join(names) == "1.JPG later/1.jpg left/2.jpg left/3.jpg right/2.jpg right/3.jpg undated/1.jpg"
     notes = value(read_json(tmp_path / "photos.json"), "notes")
-    assert notes[0] == "1 photos are smaller copies of the same shots and are left out (web/1.jpg of 1.JPG)"
+    assert "2 photos are other copies of the same shots" in notes[0] and "(left/edited/3.jpg of left/3.jpg)" in notes[0]
 
 
 @pytest.mark.parametrize("place", ["photos", "project/photos"])

@@ -84,6 +84,13 @@ def test_photos_without_a_position_are_compared_with_all_or_in_large_sets_with_t
     assert set(many) < set(few)
 
 
+def test_of_photos_without_features_none_look_alike(tmp_path):
+    with pycolmap.Database.open(tmp_path / "features.db") as database:
+        camera = database.write_camera(pycolmap.Camera(model="PINHOLE", width=9, height=9, params=[9, 9, 4, 4]))
+        database.write_image(pycolmap.Image(name="a.jpg", camera_id=camera))
+    assert alike_pairs(tmp_path / "features.db", 5) == []
+
+
 def test_a_long_sequence_closes_loops_where_photos_look_alike():
     photos = [photo(f"{i:03d}.jpg") for i in range(30)]
     kind, reason, pairs = chosen(photos, PAIRS, alike=[("029.jpg", "003.jpg")])

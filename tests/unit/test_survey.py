@@ -73,6 +73,13 @@ def changed(lines, ending, column, change):
     return found
 
 
+def moved(view, shift):
+    """A view from a place beside its own."""
+    pose = view.cam_from_world.copy()
+    pose[:3, 3] -= pose[:3, :3] @ shift
+    return replace(view, cam_from_world=pose)
+
+
 def off(report, model):
     """(N,) distances of camera centres from the true ones, in metres."""
     names, _, centres = camera_poses(model)
@@ -135,6 +142,23 @@ def test_identical_positions_give_no_metre(tmp_path, model):
     report, _, rows = georeferenced(tmp_path, model, photos)
     assert value(report, "status") == "upright" and "spread over 0.0 m" in value(report, "reason")
     assert rows == {} and value(report, "length_unit") == "scene units"
+
+
+def test_identical_positions_say_nothing_beside_control_points(tmp_path, model):
+    photos = [replace(FLIGHT.photos()[0], name=name) for name in FLIGHT.names]
+    report, found, rows = georeferenced(tmp_path, model, photos, gcp_lines(FLIGHT, PLACES, NAMES, noise_px=0.3))
+    assert value(report, "adjusted_to_positions") == 0 and rows["00.jpg"]["used"] == "no"
+    assert off(report, found).max() < 0.4
+
+
+def test_heights_of_zero_throughout_are_unknown(tmp_path):
+    heights = np.where(np.arange(24) % 2, 30.0, 0.0)  # as along a facade, up and down
+    flight = replace(FLIGHT, views=[moved(view, [0, 0, h]) for view, h in zip(FLIGHT.views, heights)])
+    photos = [replace(photo, altitude_m=0.0) for photo in flight.photos()]
+    report, found, _ = georeferenced(tmp_path, flight.model(), photos)
+    assert value(report, "heights") == "relative"
+    centres = camera_poses(found)[2]
+    assert np.ptp(centres[:, 2]) == pytest.approx(np.ptp(flight.centres[:, 2]), rel=0.02)
 
 
 def test_positions_along_one_line_do_not_tilt_the_model(tmp_path, model):
@@ -207,8 +231,10 @@ def test_points_that_are_too_far_off_for_what_is_stated_are_named_the_worst_firs
 def test_heights_may_be_unknown_and_the_crs_may_have_a_vertical_part(tmp_path, model):
     lines = gcp_lines(FLIGHT, PLACES, NAMES, crs="EPSG:25832")
     lines = ["EPSG:25832+7837", *changed(lines[1:], "e", 2, lambda z: np.nan)]
+    lines = changed(lines, "e", 0, lambda x: x + 1)
     report, _, rows = georeferenced(tmp_path, model, without_gps(), lines)
     assert rows["e"]["up_m"] == "" and rows["e"]["used"] == "yes"
+    assert any(" north);" in note for note in value(report, "control_notes"))
     crs = pyproj.CRS.from_user_input(value(report, "crs"))
     assert crs.is_compound and "DHHN2016" in crs.name
     place = scene_frame(report).in_crs(scene_frame(report).apply(FRAME.inverse(PLACES[:1])))[0]
@@ -307,6 +333,13 @@ def test_control_points_along_one_line_are_refused(tmp_path, model):
         georeferenced(tmp_path, model, without_gps(), gcp_lines(FLIGHT, along, list("abcde")))
 
 
+def test_control_points_of_which_those_that_agree_lie_along_one_line_are_refused(tmp_path, model):
+    places = np.array([[-30, -15, 0.1], [0, 0, 0.1], [30, 15, 0.1], [-20, 20, 1.0]])
+    lines = changed(gcp_lines(FLIGHT, places, list("abcd"), noise_px=0.3), "d", 1, lambda y: y + 25)
+    with pytest.raises(StageError, match="a, b, c lie along one line"):
+        georeferenced(tmp_path, model, without_gps(), lines)
+
+
 def test_control_points_far_from_gps_are_refused(tmp_path, model):
     lines = [
         changed([line], line.split("\t")[-1], 1, lambda y: y + 5000)[0] for line in gcp_lines(FLIGHT, PLACES, NAMES)[1:]
@@ -359,11 +392,11 @@ def test_what_a_spreadsheet_adds_to_the_first_line_does_no_harm(tmp_path, first,
     assert read_geo(tmp_path / "geo.txt")["a b.jpg"].longitude_deg == 8.5
 
 
-def a_photo(folder, name, xmp=b"", orientation=1):
+def a_photo(folder, name, xmp=b"", orientation=1, error_m=0.0):
     folder.mkdir(exist_ok=True)
     exif = Image.Exif()
     exif[Base.Orientation] = orientation
-    exif[IFD.GPSInfo] = {1: "N", 2: (47.0, 30.0, 0.0), 3: "E", 4: (8.0, 15.0, 0.0), 5: b"\0", 6: 500.0}
+    exif[IFD.GPSInfo] = {1: "N", 2: (47.0, 30.0, 0.0), 3: "E", 4: (8.0, 15.0, 0.0), 5: b"\0", 6: 500.0, 31: error_m}
     pixels = np.random.default_rng(len(name) + ord(name[0])).integers(0, 255, (40, 60, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(folder / name, exif=exif, xmp=xmp)
 
@@ -373,19 +406,21 @@ def listed(folder, tmp_path):
     return {photo.name: photo for photo in read_photos(tmp_path / "photos.json")}
 
 
-def test_accuracies_are_read_from_xmp(tmp_path):
+def test_accuracies_are_read_from_xmp_and_exif(tmp_path):
     folder = tmp_path / "flight"
     dji = b'<x drone-dji:RtkStdLon="0.012" drone-dji:RtkStdLat="0.016" drone-dji:RtkStdHgt="0.03"/>'
     pix4d = b"<Camera:GPSXYAccuracy>5/100</Camera:GPSXYAccuracy><Camera:GPSZAccuracy>.1</Camera:GPSZAccuracy>"
     a_photo(folder, "a.jpg", dji)
     a_photo(folder, "b.jpg", pix4d, orientation=6)
     a_photo(folder, "c.jpg", b'<x drone-dji:RtkStdLon="0.0" drone-dji:RtkStdLat="0.0" drone-dji:RtkStdHgt="n/a"/>')
+    a_photo(folder, "d.jpg", error_m=25.5)
+    a_photo(folder, "e.jpg", pix4d, error_m=25.5)
     photos = listed(folder, tmp_path)
     assert photos["a.jpg"].horizontal_sd_m == pytest.approx(np.sqrt((0.012**2 + 0.016**2) / 2))
     assert photos["a.jpg"].vertical_sd_m == 0.03
     assert (photos["b.jpg"].horizontal_sd_m, photos["b.jpg"].vertical_sd_m) == (0.05, 0.1)
     assert (photos["c.jpg"].horizontal_sd_m, photos["c.jpg"].vertical_sd_m) == (None, None)
-    assert gps_accuracies(list(photos.values()), 3.0)[2].tolist() == [3.0, 3.0]
+    assert gps_accuracies(list(photos.values()), 3.0)[2:].tolist() == [[3.0, 3.0], [25.5, 25.5], [0.05, 0.1]]
 
 
 @pytest.mark.parametrize("name", ["geo.txt", "GEO.TXT"])
