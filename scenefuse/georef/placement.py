@@ -181,7 +181,7 @@ def beside_gps(
         )
     accuracy_m, extent = float(np.median(gps.sd_m[:, 0])), _extent(target)[0]
     inliers = np.sqrt(np.nansum((difference - shift) ** 2, axis=1)) <= _limit(accuracy_m, extent, settings)
-    inliers &= _tells_scale(extent, accuracy_m)
+    inliers &= _first_at(target) & _tells_scale(extent, accuracy_m)
     if not inliers.any():
         return replace(placement, inliers=inliers, gps_shift=shift)
     start = [np.array([s.x_in_model for s, u in zip(located, points) if u]), gps.centres[inliers]]
@@ -215,6 +215,13 @@ def _tells_scale(extent: float, accuracy_m: float) -> bool:
     return bool(extent >= MAX_DEVIATIONS * accuracy_m)
 
 
+def _first_at(target: Array) -> NDArray[np.bool_]:
+    """(N,) the first photo at each position (N, 3): phones write their last fix into those that follow."""
+    first = np.zeros(len(target), dtype=bool)
+    first[np.unique(np.nan_to_num(target), axis=0, return_index=True)[1]] = True
+    return first
+
+
 def middle_of(difference: Array) -> Array:
     """(3,) medians of (N, 3) differences; 0 where none is known."""
     known = np.isfinite(difference)
@@ -238,13 +245,15 @@ def place_by_gps(
     other say nothing about scale: then the model is only turned upright. `sd_m` is the accuracy that the positions
     state.
     """
-    accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target)
+    fresh = _first_at(target)
+    accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target[fresh])
     limit = _limit(accuracy_m, extent[0], settings)
     if not _tells_scale(extent[0], accuracy_m):
         reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {accuracy_m:g} m"
         return upright(up, reason)
-    fitted, inliers, levelled = _fit(centres, target, up, accuracy_m, limit, seed, sure_up)
-    if inliers.sum() < max(PHOTOS_OF_ONE_ERROR, 0.5 * len(target)):
+    inliers = fresh.copy()
+    fitted, inliers[fresh], levelled = _fit(centres[fresh], target[fresh], up, accuracy_m, limit, seed, sure_up)
+    if inliers.sum() < max(PHOTOS_OF_ONE_ERROR, 0.5 * fresh.sum()):
         reason = f"only {inliers.sum()} of {len(target)} GPS positions agree with the cameras within {limit:g} m"
         return upright(up, reason)
     reason = f"{inliers.sum()} of {len(target)} photos by GPS"

@@ -216,6 +216,17 @@ def test_wild_positions_do_no_harm_without_heights_or_along_one_line():
         assert placement.local_from_model.scale == pytest.approx(PLANTED.scale, rel=0.01)
 
 
+def test_a_fix_that_a_phone_writes_into_dozens_of_photos_counts_once():
+    angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    around = np.stack([20 * np.cos(angle), 20 * np.sin(angle), np.full(60, 1.5)], axis=1)
+    for seed in range(3):
+        target = around + np.random.default_rng(seed).normal(0, 1.0, around.shape)
+        target[30:58] = target[30]
+        found = place_by_gps(around / 10, target, np.array([0.0, 0, 1]), GeoreferenceSettings(), 0)
+        assert found.inliers.sum() > 30 and not found.inliers[31:58].any()
+        assert found.local_from_model.scale == pytest.approx(10, rel=0.04)
+
+
 def test_positions_that_hardly_move_give_no_scale():
     target = flight() * 0.02
     placement = place_by_gps(PLANTED.inverse().apply(target), target, np.array([0, 0, 1.0]), SETTINGS, seed=0)
