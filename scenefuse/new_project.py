@@ -16,7 +16,7 @@ from scenefuse.core.settings import OWN_SETTINGS, PACKAGE, ROOT, schema_of
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.tables import Row, read_table, read_text
 from scenefuse.core.transforms import FIXING_POINTS
-from scenefuse.photos.photo_files import SUFFIXES, VIDEO_SUFFIXES, in_folders, photo_files
+from scenefuse.photos.photo_files import MIN_OBJECT_PHOTOS, SUFFIXES, VIDEO_SUFFIXES, in_folders, photo_files
 
 SCENES, OBJECTS = Path("config/scenes.tsv"), Path("config/objects.tsv")
 COLUMNS = {
@@ -101,7 +101,8 @@ def project_rows(folder: Path, scene: Path | None, objects: Sequence[Path]) -> d
             raise StageError(f"{inner} lies in {outer}, whose photos in folders below count too; move it elsewhere")
     scene_name = "" if scene is None else default_name(scene)
     scenes = [] if scene is None else [{"scene": scene_name} | _source(scene, folder)]
-    rows = [{"object": name, "scene": scene_name} | _source(path, folder) for name, path in zip(names, objects)]
+    sources = [_source(path, folder, MIN_OBJECT_PHOTOS) for path in objects]
+    rows = [{"object": name, "scene": scene_name} | source for name, source in zip(names, sources)]
     for row in rows:
         # Where `pick` saves what is clicked.
         row |= {"prompts": f"config/{row['object']}_prompts.tsv"} if "photos" in row else {}
@@ -128,16 +129,16 @@ def _stem(path: Path) -> str:
     return path.stem if path.is_file() else path.resolve().name
 
 
-def _source(path: Path, folder: Path) -> dict[str, str]:
-    """The cell of a row that names photos or a cloud, relative to the project if it lies inside."""
+def _source(path: Path, folder: Path, least: int = FIXING_POINTS) -> dict[str, str]:
+    """The cell of a row that names photos, so many at least, or a cloud, relative to the project if it lies inside."""
     if not path.exists():
         raise StageError(f"{path} does not exist; give a folder of photos, a video or a cloud")
     suffix = path.suffix.lower()
     if path.is_dir():
         if folder.resolve().is_relative_to(path.resolve()):
             raise StageError(f"the project {folder} would lie among its photos in {path}; give a folder of its own")
-        if (count := len(photo_files(path))) < FIXING_POINTS:
-            raise StageError(f"{path} holds {count} {'photo' if count == 1 else 'photos'}; cameras need three or more")
+        if (count := len(photo_files(path))) < least:
+            raise StageError(f"{path} holds {count} {'photo' if count == 1 else 'photos'}; {least} or more are needed")
     elif not (is_cloud(path) or suffix in VIDEO_SUFFIXES):
         raise StageError(f"{path} is not a folder of photos, a video nor a cloud ({', '.join(READERS)})")
     elif path.stat().st_size == 0:

@@ -22,6 +22,7 @@ from scenefuse.masks.sam2 import SIDE_PX, Sam2, query_sam2, segment, segment_lik
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
 from scenefuse.masks.votes import MIN_AGREEMENT, MIN_KNOWN_POINTS, points_held
 from scenefuse.mvs.stereo_points import with_stereo_points
+from scenefuse.photos.photo_files import MIN_OBJECT_PHOTOS
 from scenefuse.photos.workspace import View, Workspace, read_model
 
 # As MAX_WRONG_SHARE, for GrabCut's first masks, and for another hull by which masks are compared: where many lack a
@@ -51,7 +52,7 @@ class MaskSettings:
     """Largest reprojection error of a prompt clicked in several photos, if 5 % of what is clicked in one is not more;
     and how far a click inside or outside may lie on the wrong side of its mask's outline. Others are left out and
     named."""
-    min_photos: int = 5
+    min_photos: int = MIN_OBJECT_PHOTOS
     """Fewest good masks to go on with."""
     hull_voxels: int = 160
     """Voxels of the visual hull along the longest side of the box."""

@@ -31,6 +31,8 @@ UNREADABLE |= {".iiq", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".srw", "
 UNREADABLE |= {".mrw", ".erf", ".kdc", ".dcr", ".fff"}
 
 
+# Fewest photos of an object: so many of its masks have to be good.
+MIN_OBJECT_PHOTOS = 5
 # Phones' photos have 200 million pixels. A small file that claims more would fill the memory.
 MAX_PIXELS = 250_000_000
 # What decoding a damaged file ends with; a parser's error is a SyntaxError.

@@ -45,9 +45,8 @@ Pair = tuple[str, str]
 # GPS positions that spread less (RMS, metres) than this do not separate neighbours from others: five times the standard
 # error of a plain receiver.
 MIN_GPS_SPREAD_M = 15.0
-# Positions so near each other are one: a phone writes its last fix into dozens of photos.
-POSITION_STEP_M = 0.1
-# Share of the photos that may stand at one position with more photos than each is compared with.
+# Share of the photos that may stand at one position with more photos than each is compared with: a phone writes its
+# last fix into dozens.
 MAX_REPEATED_SHARE = 0.1
 # Why photos have next to no features: those that are dark as a whole are brightened before (photos.photos).
 DULL = "blur, fog, darkness with a few lamps, or surfaces without texture; look at them"
@@ -298,8 +297,7 @@ def _gps_usable(photos: list[Photo], neighbours: int) -> bool:
     known, positions = gps_positions(photos)
     if len(known) < max(3, 0.8 * len(photos)) or gps_spread_m(positions) <= MIN_GPS_SPREAD_M:
         return False
-    cells = np.rint(_metric(positions) / POSITION_STEP_M)
-    _, at, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    _, at, counts = np.unique(np.nan_to_num(positions), axis=0, return_inverse=True, return_counts=True)
     return float((counts[at.ravel()] > neighbours).mean()) <= MAX_REPEATED_SHARE
 
 

@@ -95,6 +95,12 @@ def test_object_without_prompts_and_masks(project, refused):
     assert "'shed' has neither prompts nor masks" in refused("-n", "results/objects/shed/masks.json")
 
 
+def test_an_object_of_few_photos_stops_before_anything_runs(project, refused):
+    project.photos("close", 4)
+    project.objects = "object\tphotos\tprompts\nshed\tclose\tprompts.tsv\n"
+    assert "object 'shed' has 4 photos, 5 or more are needed" in refused("-n", "results/objects/shed/masks.png")
+
+
 @pytest.mark.parametrize(
     ("table", "column", "target"),
     [
@@ -130,7 +136,7 @@ def test_known_lengths_in_unknown_photos_of_an_object_stop_before_anything_runs(
     (project.path / "bar.tsv").write_text("\n".join(["length\tmetres\tend\tphoto\tx_px\ty_px", *rows]) + "\n")
     output = refused("-n", "results/objects/shed/sparse.json")
     assert (
-        "object 'shed': bar.tsv: point bar, 1.5 m: a is clicked in 7.jpg, which is none of the 3 photos (0.jpg, ...)"
+        "object 'shed': bar.tsv: point bar, 1.5 m: a is clicked in 7.jpg, which is none of the 5 photos (0.jpg, ...)"
         in output
     )
 
@@ -138,15 +144,15 @@ def test_known_lengths_in_unknown_photos_of_an_object_stop_before_anything_runs(
 @pytest.mark.parametrize(
     ("column", "cells", "words"),
     [
-        ("prompts", "7.jpg\t1\t2", "in 7.jpg, which is none of the 4 photos (0.jpg, ...)"),
-        ("prompts", "2.jpg\t1\t2", "in 2.jpg, but only 2 of the 4 photos are used (object.frames)"),
-        ("fiducials", "3.jpg\t1\t2", "in 3.jpg, which is none of the 3 photos (0.jpg, ...)"),
+        ("prompts", "7.jpg\t1\t2", "in 7.jpg, which is none of the 5 photos (0.jpg, ...)"),
+        ("prompts", "2.jpg\t1\t2", "in 2.jpg, but only 2 of the 5 photos are used (object.frames)"),
+        ("fiducials", "7.jpg\t1\t2", "in 7.jpg, which is none of the 5 photos (0.jpg, ...)"),
         ("fiducials", "0.jpg\t1,5\t2", "1,5 has a decimal comma, write 1.5"),
     ],
 )
 def test_clicks_that_cannot_be_used_stop_before_anything_runs(project, refused, column, cells, words):
     project.photos("flight")
-    project.photos("close", 4)
+    project.photos("close")
     project.config["object"]["frames"] = {"max_frames": 2}
     project.objects = HEADER + "shed\tyard\tclose\tfiducials.tsv\tprompts.tsv\t\n"
     for name in ("fiducials", "prompts"):
@@ -157,7 +163,7 @@ def test_clicks_that_cannot_be_used_stop_before_anything_runs(project, refused, 
 
 
 def test_a_click_in_a_photo_that_is_used_since_others_are_copies_is_no_error(project, snakemake):
-    project.photos("close", 4)
+    project.photos("close")
     shutil.copy(project.path / "close/0.jpg", project.path / "close/0 copy.jpg")
     project.config["object"]["frames"] = {"frame_step": 3}
     project.scenes, project.objects = "scene\tphotos\n", HEADER + "shed\t\tclose\t\tprompts.tsv\t\n"
@@ -169,10 +175,10 @@ def test_a_click_in_a_photo_that_is_used_since_others_are_copies_is_no_error(pro
 def test_masks_of_other_photos_stop_before_anything_runs(project, refused):
     project.photos("close")
     project.photos("masks")
-    for k in range(3):
+    for k in range(5):
         (project.path / f"masks/{k}.jpg").rename(project.path / f"masks/DJI_{k}.jpg")
     project.scenes, project.objects = "scene\tphotos\n", HEADER + "shed\t\tclose\t\t\tmasks\n"
-    said = "object 'shed': masks that match no photo: 3 masks in masks (first: DJI_0.jpg), photos are named like 0.jpg;"
+    said = "object 'shed': masks that match no photo: 5 masks in masks (first: DJI_0.jpg), photos are named like 0.jpg;"
     assert said in refused("-n", "results/objects/shed/masks.png")
 
 
@@ -181,4 +187,4 @@ def test_control_points_in_unknown_photos_stop_before_anything_runs(project, ref
     project.scenes = "scene\tphotos\tcontrol\nyard\tflight\tgcp.txt\n"
     (project.path / "gcp.txt").write_text("EPSG:32632\n1 2 3 10 10 0.jpg A\n1 2 3 10 10 7.jpg A\n")
     output = refused("-n", "results/scenes/yard/georeference.json")
-    assert "scene 'yard': gcp.txt: point A is clicked in 7.jpg, which is none of the 3 photos (0.jpg, ...)" in output
+    assert "scene 'yard': gcp.txt: point A is clicked in 7.jpg, which is none of the 5 photos (0.jpg, ...)" in output

@@ -69,7 +69,7 @@ def project(tmp_path, snakemake, request):
     """
     for name in ("flight", "shed", "barn"):
         (tmp_path / name).mkdir()
-        for index in range(3):
+        for index in range(5):
             noise = np.random.default_rng(index).integers(0, 255, (48, 64, 3), dtype=np.uint8)
             cv2.imwrite(str(tmp_path / name / f"{index}.jpg"), noise)
             os.utime(tmp_path / name / f"{index}.jpg", (1e9, 1e9))

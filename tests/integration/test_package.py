@@ -132,7 +132,7 @@ def test_an_installed_package_makes_a_project_and_plans_its_run(installed, tmp_p
     rng = np.random.default_rng(0)
     for folder in ("flight", "my house"):
         (tmp_path / folder).mkdir()
-        for index in range(3):
+        for index in range(5):
             cv2.imwrite(str(tmp_path / folder / f"{index}.jpg"), rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
     words = ("init", "yard", "--scene", "flight", "--objects", "my house")
     status, output = scenefuse(*words, cwd=tmp_path, library=installed)
@@ -191,11 +191,11 @@ def test_names_are_made_of_what_files_are_called_and_said(tmp_path, monkeypatch,
     said = capsys.readouterr().out
     assert "Häuschen neu.ply: an object, called Hauschen_neu (names hold only" in said
     assert "site.laz: the scene\n" in said
-    for name in ("a.jpg", "b.jpg", "small/a.jpg"):
+    for name in ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "small/a.jpg"):
         Path("shots", name).parent.mkdir(parents=True, exist_ok=True)
         Path("shots", name).write_bytes(b"photo")
     init(Path("other"), objects=(Path("shots"),))
-    assert "shots: an object, 3 photos, 1 of them in small/, which is few" in capsys.readouterr().out
+    assert "shots: an object, 5 photos, 1 of them in small/, which is few" in capsys.readouterr().out
     assert "Hauschen_neu\tsite\t" in Path("new/config/objects.tsv").read_text()
 
 

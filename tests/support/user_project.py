@@ -54,7 +54,7 @@ class Project:
         self.scenes = "scene\tphotos\nyard\tflight\n"
         self.objects = HEADER + "shed\tyard\tclose\tclicks.tsv\tprompts.tsv\t\n"
 
-    def photos(self, folder: str, count: int = 3) -> None:
+    def photos(self, folder: str, count: int = 5) -> None:
         """Make a folder with this many photos of noise."""
         (self.path / folder).mkdir()
         rng = np.random.default_rng(0)

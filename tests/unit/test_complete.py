@@ -185,7 +185,7 @@ def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
         ("empty", "the photo folder empty holds no photos"),
         ("filmed", r"filmed holds no photos; .*\(or give a video itself: filmed/clip.MP4\)"),
         ("notes.txt", r"notes.txt is not a readable TXT cloud \(none of its first lines holds three numbers"),
-        ("one", "one holds 1 photo; cameras need three or more"),
+        ("one", "one holds 1 photo; 5 or more are needed"),
         ("flight", "flight is given as the scene and as an object"),
         ("flight/shed", "flight/shed lies in .*flight, whose photos in folders below count too; move it elsewhere"),
     ):
@@ -284,7 +284,7 @@ def test_init_ends_with_the_next_command_by_its_real_names_and_says_how_many_pho
     init(Path("yard"), scene=Path("many"), objects=(Path("close"),))
     said = capsys.readouterr().out
     assert "next: cd yard && scenefuse pick --object close " in said
-    assert "many: the scene, 30 photos\n" in said and "close: an object, 3 photos, which is few: every part" in said
+    assert "many: the scene, 30 photos\n" in said and "close: an object, 5 photos, which is few: every part" in said
     init(Path("bare"))
     assert "next: cd bare, and fill in both tables in config/ " in capsys.readouterr().out
     with pytest.raises(StageError, match="close holds photos, and the project would lie among them; give a folder of"):

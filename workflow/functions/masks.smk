@@ -1,7 +1,12 @@
 # What masks are made from, and how.
 from scenefuse.masks.algebra import mask_folders
 from scenefuse.masks.sam2_weights import WEIGHTS
-from scenefuse.photos.photo_files import masks_by_name, no_match, pictures_below
+from scenefuse.photos.photo_files import (
+    MIN_OBJECT_PHOTOS,
+    masks_by_name,
+    no_match,
+    pictures_below,
+)
 
 
 @cache
@@ -38,7 +43,12 @@ def mask_inputs(wildcards):
     """What the masks of an object are made from: your own masks, or prompts and perhaps weights; masks to combine."""
     row = object_row(wildcards.object)
     settings = settings_of(wildcards)["object"]["masks"]
-    photos_of(row, f"object '{wildcards.object}'")
+    who = f"{config['objects']}, object '{wildcards.object}'"
+    photos = names_in(photos_of(row, who), who)
+    if photos and len(photos) < MIN_OBJECT_PHOTOS:
+        refuse(
+            f"{who} has {len(photos)} photos, {MIN_OBJECT_PHOTOS} or more are needed; take more"
+        )
     try:
         folders = mask_folders(kept_masks(wildcards))
     except StageError as error:
