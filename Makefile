@@ -9,7 +9,7 @@ demo: .venv/ready
 	snakemake --configfile config/demo.yaml --cores $(CORES)
 	python -m scenefuse export --configfile config/demo.yaml --cores $(CORES)
 
-# Unit tests that start no process, but few slow ones; those of one package and what imports it: make check PART=masks.
+# Quick unit tests that start no process; those of one package and what imports it: make check PART=masks.
 check: .venv/tests
 	pytest -n $(CORES) --dist loadfile --serial-kernels -m "not process and not slow" $(if $(PART),--part $(PART)) tests/unit
 

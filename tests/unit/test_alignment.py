@@ -130,6 +130,7 @@ def found(pair, tmp_path_factory):
     return aligned(tmp_path_factory.mktemp("found"), *pair)
 
 
+@pytest.mark.slow
 def test_a_planted_similarity_is_found(found):
     assert value(found, "found") is True
     truth = OBJECT_FROM_WORLD.inverse()
@@ -145,6 +146,7 @@ def test_a_planted_similarity_is_found(found):
     assert value(found, "object_photos") == 10 and value(found, "scene_photos") == 12
 
 
+@pytest.mark.slow
 def test_a_scene_that_is_bent_far_away_does_not_bend_the_pose_of_what_the_photos_look_at(tmp_path):
     whole = world(1)
     far = np.maximum(np.linalg.norm(whole.points, axis=1) - 3, 0)
@@ -162,6 +164,7 @@ def test_a_scene_that_is_bent_far_away_does_not_bend_the_pose_of_what_the_photos
     assert shifts[0] < 0.5 * shifts[1]
 
 
+@pytest.mark.slow
 def test_how_certain_the_place_is_does_not_depend_on_what_lies_behind_the_object(pair, found, tmp_path):
     behind, own, strange = world(5, 900, (4, 3, 2)), near(world(1)), world(2, 150, (2, 2, 1))
     seen = World(
@@ -173,6 +176,7 @@ def test_how_certain_the_place_is_does_not_depend_on_what_lies_behind_the_object
     assert value(again, "translation_sd") < 2 * value(found, "translation_sd")
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_output_and_is_not_written_to(pair, found, tmp_path):
     databases = [side[1] for side in pair]
     for database in databases:
@@ -214,6 +218,7 @@ def positions(folder, shift=(0, 0, 0), noise_m=0.3, scene_sd_m=0.3):
     }
 
 
+@pytest.mark.slow
 def test_gps_says_the_same(pair, found, tmp_path):
     beside = aligned(tmp_path, *pair, **positions(tmp_path))
     assert value(beside, "scene_from_object") == value(found, "scene_from_object")
@@ -236,6 +241,7 @@ def aligned_pair(pair, consensus, tmp_path, monkeypatch):
     return lambda files: aligned(tmp_path, *pair, **files)
 
 
+@pytest.mark.slow
 def test_gps_that_contradicts_the_pose_is_a_note(aligned_pair, found, tmp_path):
     beside = aligned_pair(positions(tmp_path, (9, 0, 0)))
     assert value(beside, "scene_from_object") == value(found, "scene_from_object")
@@ -270,6 +276,7 @@ def test_gps_that_spreads_too_little_says_nothing(aligned_pair, tmp_path):
     assert value(beside, "found") is True and value(beside, "gps_photos") == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [0.0, 12.0])
 def test_gps_tells_an_object_from_its_twin(tmp_path, shift):
     obj, scene = with_twin(tmp_path)
@@ -279,6 +286,7 @@ def test_gps_tells_an_object_from_its_twin(tmp_path, shift):
     assert value(found, "settled_by_gps") is True and "GPS distinguishes it from its like" in value(found, "reason")
 
 
+@pytest.mark.slow
 def test_an_object_that_stands_there_twice_is_not_placed(tmp_path):
     found = aligned(tmp_path, *with_twin(tmp_path))
     assert value(found, "found") is False and "twice" in value(found, "reason")

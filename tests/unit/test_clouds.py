@@ -104,6 +104,7 @@ def on_sphere(count, radius, middle, rng):
     return directions / np.linalg.norm(directions, axis=1, keepdims=True) * radius + middle
 
 
+@pytest.mark.slow
 def test_a_sparse_body_under_a_dense_head_is_none_of_the_strays_which_still_are():
     rng = np.random.default_rng(0)
     head = on_sphere(300_000, 0.12, [0, 0, 1.7], rng)

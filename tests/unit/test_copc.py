@@ -84,6 +84,7 @@ def test_a_box_is_read_whole_without_the_rest(tmp_path, small_nodes):
     assert sum(node.point_count for node in nodes) < len(cloud) / 5
 
 
+@pytest.mark.slow
 def test_every_node_lies_in_its_cube(tmp_path, small_nodes):
     path = written(tmp_path, ground())
     with laspy.CopcReader.open(path) as file:
@@ -151,6 +152,7 @@ def test_a_stray_without_a_place_in_the_crs_is_named_and_leaves_no_file(tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
+@pytest.mark.slow
 def test_memory_is_bounded_where_tiles_are_heaps_with_strays(tmp_path, small_nodes, monkeypatch):
     """Boxes that strays stretch over all of the scene say nothing of where the points are."""
     points = np.random.default_rng(0).random((12_000, 3)) * [5, 5, 1]

@@ -121,6 +121,7 @@ def test_in_a_large_scene_clicks_find_the_object_in_the_tiles_along_their_rays(c
 BESIDE = np.concatenate([YARD, shell([4, 4, 2.5], [5.0, 0, 1.25], 6000, 2)])
 
 
+@pytest.mark.slow
 def test_clicks_outside_or_a_box_leave_out_what_touches_the_object(crop):
     other = np.arange(len(BESIDE)) >= len(YARD)
     on_roof = inside((-2.8, -2, 2.8), (2.8, -2, 2.8), (-2.8, -2, 0.4), (0, 0, 3))
@@ -135,6 +136,7 @@ def test_clicks_outside_or_a_box_leave_out_what_touches_the_object(crop):
     assert kept[other].mean() < 0.3 and kept[: len(OWN)][OWN].mean() > 0.85
 
 
+@pytest.mark.slow
 def test_what_is_connected_with_something_much_larger_is_the_box_of_the_clicks_and_that_is_said(crop):
     row = np.concatenate([YARD, shell([30, 4, 3], [18, 0, 1.5], 40000, 3)])
     kept, report = crop(inside((-2.8, -2, 2.8), (-0.5, -2, 2.8), (-2.8, -2, 0.4), (-1, 0, 3)), row)

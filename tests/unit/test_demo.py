@@ -66,6 +66,7 @@ def render_all(root: Path) -> None:
     capture.render_object(name="house", **house, settings=ORBIT, camera="real", seed=0)
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes_and_all_files(tmp_path: Path, rendered: Path, world: World) -> None:
     render_all(tmp_path)
     again, once = MESH(world, world.owner("house")), world.mesh(world.owner("house"))
@@ -300,6 +301,7 @@ def test_nothing_is_seen_through_a_wall(world: World) -> None:
     assert not seen[:, 0].any() and seen[:, 1].any()
 
 
+@pytest.mark.slow
 def test_the_sky_is_hidden_under_the_balloon(world: World) -> None:
     sky = openness(world, 8, 0)
     x, y = world.bounds("balloon").mean(0)[:2]

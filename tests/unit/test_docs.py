@@ -91,6 +91,7 @@ def test_commands_name_existing_scripts_and_settings(page):
     assert missing_scripts(text) + missing_settings(text) == []
 
 
+@pytest.mark.slow
 @names(CURRENT)
 def test_settings_exist(page):
     assert missing_keys(page.read_text()) == []

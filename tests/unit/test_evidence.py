@@ -44,6 +44,7 @@ def far():
     return pack(photographs(8, 6.0, radius=4.0))
 
 
+@pytest.mark.slow
 def test_the_sharper_side_stays_where_both_measured(near, far):
     obj, scene = sheet(-0.8, 0.4, 0.03), sheet(-0.4, 0.8, 0.06, noise=0.005)
     found = check(obj, scene, near, far, nerf_only=False)
@@ -69,6 +70,7 @@ def test_a_cloud_without_normals_is_measured_as_one_with_them(near, far, bare):
     assert (found.scene.fields["evidence"] == Evidence.MEASURED).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_a_rough_object_does_not_take_the_place_of_a_smooth_scene(near, far):
     rough, smooth = sheet(-0.4, 0.4, 0.015, noise=0.012), sheet(-0.4, 0.4, 0.02)
     of_rough, of_smooth = (np.abs(cloud.points[:, 0]) < 0.3 for cloud in (rough, smooth))
@@ -100,6 +102,7 @@ def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_
     assert not found.added[last].any() and found.contradicted[last].all()
 
 
+@pytest.mark.slow
 def test_what_close_ups_show_and_do_not_confirm_beside_the_object_goes_though_the_flight_confirms_it(near):
     flight = pack(photographs(8, 9.0, radius=6.0))
     obj, floating = sheet(-1.0, 0.0, 0.01, half=1), sheet(0.01, 0.02, 0.01, z=0.037, half=1)
@@ -135,6 +138,7 @@ def test_what_the_scene_measured_goes_only_where_something_is_left_beside_it(nea
     assert inside.any() and (found.reason[inside] == Reason.KEPT).all()
 
 
+@pytest.mark.slow
 def test_of_a_very_dense_scene_some_points_are_checked_and_the_others_follow(near, far, monkeypatch):
     floating = sheet(-0.2, 0.2, 0.03, z=0.3)
     obj, scene = sheet(-0.8, 0.4, 0.03), concatenate([sheet(-0.8, 0.8, 0.02), floating])
@@ -170,6 +174,7 @@ def test_an_object_that_is_a_little_off_is_laid_on_the_scene(near, far):
     assert np.abs(found.obj.points[:, 2] - 0.3).max() < 0.05
 
 
+@pytest.mark.slow
 def test_an_object_whose_pose_is_more_certain_than_the_surfaces_stays(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04)
     off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.008]))
@@ -182,6 +187,7 @@ def test_an_object_whose_pose_is_more_certain_than_the_surfaces_stays(near, far)
     assert check(*sides, nerf_only=False, certain=0.0).moved > 0.005
 
 
+@pytest.mark.slow
 def test_a_sheet_that_does_not_say_how_large_it_is_keeps_its_scale():
     rng = np.random.default_rng(1)
     sheets = [sheet(-0.8, 0.8, step, noise=noise) for step, noise in ((0.02, 0.003), (0.03, 0.008))]
@@ -280,6 +286,7 @@ def test_every_point_says_what_is_known_of_it(near, far):
     assert value(report, "object_measured") + value(report, "object_contradicted") <= len(obj)
 
 
+@pytest.mark.slow
 def test_a_pot_before_a_wall_stays_where_photos_confirm_it():
     photos, flight = pack(photographs(8, 3.0, panel=0.3)), pack(photographs(8, 6.0, radius=4.0, panel=0.3))
     pot, middle = sheet(-0.13, 0.13, 0.02, z=0.3), 0.13
@@ -301,6 +308,7 @@ def test_the_objects_points_give_way_to_better_ones_within_a_spacing_only(near):
     assert added[distance > 0.022].mean() > 0.95 and added[distance < 0.018].mean() < 0.5
 
 
+@pytest.mark.slow
 def test_of_equals_the_denser_side_stays(near, far):
     coarse, fine = sheet(-0.8, 0.8, 0.04), sheet(-0.8, 0.8, 0.015)
     for obj, scene, added in ((coarse, fine, False), (fine, coarse, True)):
@@ -310,6 +318,7 @@ def test_of_equals_the_denser_side_stays(near, far):
         assert ((found.reason[around] == Reason.KEPT).mean() < 0.05) == added
 
 
+@pytest.mark.slow
 def test_in_a_hole_of_a_denser_scene_the_objects_points_are_added(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.012)
     scene = scene[np.linalg.norm(scene.points[:, :2], axis=1) > 0.08]

@@ -124,6 +124,7 @@ def test_a_folder_goes_by_what_lies_in_it(tmp_path):
     assert len(found) == 2
 
 
+@pytest.mark.slow
 def test_no_import_of_the_library_is_overlooked():
     root = Path(__file__).resolve().parents[2]
     for module in sorted((root / "scenefuse").rglob("*.py")):
@@ -168,6 +169,7 @@ def new_words(source):
     return "# A comment.\n" + source.replace('"""', '"""Anew: ', 1) + "\n# Another comment.\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "module, reached",
     [

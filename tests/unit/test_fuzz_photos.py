@@ -160,6 +160,7 @@ def cameras_and_place(path, photos):
     place_of(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
 @given(data=st.data())
 def test_cameras_of_other_programs(folder, name, data):
@@ -209,6 +210,7 @@ TABLES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TABLES)
 @given(data=st.data())
 def test_tables_and_settings(folder, name, data):

@@ -310,11 +310,13 @@ def mirrored(cloud):
     return replace(cloud, points=cloud.points * flip, normals=cloud.normals * flip.astype(np.float32))
 
 
+@pytest.mark.slow
 def test_a_mirror_image_of_the_object_is_refused(house):
     outcome = registered(mirrored(house.object), house.scene, house.up_in_object * [-1, 1, 1])
     assert not outcome.decision.registered
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_mirrored", [False, True])
 def test_the_mirror_image_of_a_nearly_symmetric_object_is_named_as_that(is_mirrored):
     trial = plant("wall", 3, ground=False, noise=0.005, object_points=4000, density_ratio=1.0)
@@ -331,6 +333,7 @@ def test_the_mirror_image_of_a_nearly_symmetric_object_is_named_as_that(is_mirro
     assert ("mirror image" in decision.reason) == is_mirrored
 
 
+@pytest.mark.slow
 def test_an_object_that_lies_upside_down_in_the_scene_is_refused_where_gravity_is_known_and_found_elsewhere(house):
     middle = house.scene.points.mean(0)
     over = shift(*middle) @ turn(X, 180) @ shift(*-middle)
@@ -344,6 +347,7 @@ def test_an_object_that_lies_upside_down_in_the_scene_is_refused_where_gravity_i
     assert without.decision.registered and at_truth(without, house, truth)
 
 
+@pytest.mark.slow
 def test_from_half_a_turn_off_the_true_pose_is_found(house):
     centre = house.scene_from_object.apply(house.object.points.mean(0))
     turned = shift(*centre) @ HALF @ shift(*-centre) @ house.scene_from_object
@@ -351,6 +355,7 @@ def test_from_half_a_turn_off_the_true_pose_is_found(house):
     assert outcome.decision.registered and at_truth(outcome, house)
 
 
+@pytest.mark.slow
 def test_an_object_that_the_scene_does_not_have_is_refused(house):
     other = plant("sculpture", 7, ground=False, noise=0.005, object_points=3000, density_ratio=1.0).scene
     decision = registered(house.object, other, house.up_in_object).decision
@@ -365,6 +370,7 @@ def test_surfaces_that_lie_behind_each_other_are_displaced_and_those_that_meet_a
     assert displaced_share(OBLONG, SQUARE, shift(0, 50, 0), tau) is None
 
 
+@pytest.mark.slow
 def test_an_object_with_a_copy_beside_it_is_refused(house):
     scene, aside, truth = house.scene, shift(0.9 * house.diagonal, 0, 0), house.scene_from_object
     starts, both = [(truth, "one"), (aside @ truth, "other")], concatenate([scene, scene.transformed(aside)])

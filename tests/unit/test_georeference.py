@@ -171,6 +171,7 @@ def test_unknown_heights_of_some_photos_take_no_part():
     assert fitted.scale == pytest.approx(PLANTED.scale, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_phones_heights_do_not_tilt_a_walk_whose_cameras_say_which_way_is_up():
     turns, leans = np.arange(32) * 2 * np.pi / 32, {}
     walked = np.stack([25 * np.cos(turns), 25 * np.sin(turns), np.full(32, 1.6)], axis=1)
@@ -293,6 +294,7 @@ def test_stage_brings_a_model_into_metres(model):
     np.testing.assert_allclose(crs_from_scene.translation, value(report, "origin_in_crs"))
 
 
+@pytest.mark.slow
 def test_lengths_are_known_as_well_as_noisy_positions_fix_the_scale(model):
     folder, names, truth = model
     exact = value(georegister_in(folder, listed(names, truth))[0], "scale")

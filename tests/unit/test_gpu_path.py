@@ -44,6 +44,7 @@ def test_the_pretended_gpu_notices_what_was_left_behind(gpu):
             mistake()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of_paper", [False, True])
 def test_training_and_rendering_on_a_gpu(gpu, tmp_path, of_paper):
     views = sphere_views(6, 40)

@@ -97,6 +97,7 @@ def test_too_few_points_determine_nothing(gate):
     assert certified(obj, few, start, scales, SPACING * trial.diagonal, trial.diagonal, seed=0) is None
 
 
+@pytest.mark.slow
 def test_the_most_likely_pose_is_taken_and_without_one_the_object_is_refused(gate, monkeypatch):
     trial, truth = gate[0], gate[0].scene_from_object
     problem = Problem(trial.object, trial.scene, ScaleRange(truth.scale, 0.3))

@@ -334,6 +334,7 @@ def test_a_photo_that_disagrees_is_segmented_again_with_the_outline_of_the_other
     assert value(read_json(tmp_path / "masks.json"), "method") == "sam2"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strict_is_right", [False, True])
 def test_propagated_masks_that_contradict_the_clicked_photo_are_made_once_more_and_said_if_they_stay(
     capture, tmp_path, monkeypatch, strict_is_right

@@ -156,6 +156,7 @@ def test_a_concave_face_leaves_its_notch_empty(tmp_path, axis, first):
     assert [np.mean(u < 0.5), np.mean(v < 0.2)] == pytest.approx([0.5, 0.2 / 0.6], abs=0.001)
 
 
+@pytest.mark.slow
 def test_a_glb_stands_upright_at_its_place(tmp_path):
     write_glb(tmp_path / "roof.glb")
     cloud = read_cloud(tmp_path / "roof.glb")

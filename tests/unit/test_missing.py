@@ -75,6 +75,7 @@ def test_a_sphere_photographed_from_all_sides_lacks_nothing_but_its_foot():
     assert missing.share(Lack.UNTEXTURED) + missing.share(Lack.CONTRADICTED) < 0.002
 
 
+@pytest.mark.slow
 def test_the_side_without_photos_was_never_seen_and_stations_stand_before_it(half):
     photos, masks, cloud = half
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
@@ -96,6 +97,7 @@ def test_the_side_without_photos_was_never_seen_and_stations_stand_before_it(hal
     assert after < 0.5 * before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("waves", "kind"), [(0.0, Lack.UNTEXTURED), (30.0, Lack.CONTRADICTED)])
 def test_points_that_no_photo_confirms_are_told_apart_by_texture(waves, kind):
     photos, masks = photographed(2 * np.pi, waves=waves)
@@ -124,6 +126,7 @@ def test_without_masks_only_the_own_points_count_and_a_note_says_so(half):
     assert plan_stations(missing, cloud, cloud, photos.views) == Plan([], 0.0)
 
 
+@pytest.mark.slow
 def test_no_station_lies_below_the_ground_or_in_a_wall(half):
     photos, masks, cloud = half
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
@@ -136,6 +139,7 @@ def test_no_station_lies_below_the_ground_or_in_a_wall(half):
     assert len(eyes) and (eyes[:, 2] > -RADIUS).all() and (eyes[:, 1] > -4.0).all()
 
 
+@pytest.mark.slow
 def test_what_a_wall_far_from_the_object_hides_is_not_shown_though_a_slit_shows_the_middle(half):
     photos, masks, cloud = half
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
@@ -233,6 +237,7 @@ def files(tmp_path, half):
     return inputs, outputs
 
 
+@pytest.mark.slow
 def test_the_stage_writes_cells_photos_and_shares(files):
     inputs, outputs = files
     find_missing(inputs=inputs, outputs=outputs)

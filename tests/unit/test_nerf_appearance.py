@@ -104,6 +104,7 @@ def _trained(photos, sphere, steps=160):
     return nerf.appearance
 
 
+@pytest.mark.slow
 def test_training_finds_planted_gains_and_leaves_exact_photos_alone(exact, spoilt, gains, sphere):
     assert float((_trained(spoilt, sphere).log_gain - gains).abs().max()) < 0.05
     assert float(_trained(exact, sphere).log_gain.abs().max()) < 0.05

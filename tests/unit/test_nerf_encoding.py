@@ -49,6 +49,7 @@ def test_dense_level_interpolates_trilinearly():
     assert out[0].tolist() == pytest.approx([0.5 + 10.0 + 180.0, 0.5], rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("log2_table", [10, 18])  # the larger one has levels that are fetched ahead
 def test_kernel_values_and_gradients_match_the_reference(device, log2_table):
     grid, table, x, weight = _problem(log2_table)

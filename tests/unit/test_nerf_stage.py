@@ -113,6 +113,7 @@ def _make_cloud(root, stage, cloud):
     )
 
 
+@pytest.mark.slow
 def test_two_stages_and_the_cloud(workspace, stage2):
     _run(workspace, "stage4", previous=stage2)
     report = read_json(workspace / "stage4.json")

@@ -114,6 +114,7 @@ def test_exact_mattes_draw_their_grey_pixels_as_they_are(sphere):
     assert (batch.matte[~batch.inside] == 0).all()
 
 
+@pytest.mark.slow
 def test_training_finds_the_sphere(sphere):
     nerf, photos, cube, result = _train(sphere, steps=400)
     depths, masks = sphere[4], sphere[1]
@@ -130,6 +131,7 @@ def test_training_finds_the_sphere(sphere):
     assert result["steps"] == 400
 
 
+@pytest.mark.slow
 def test_same_seed_same_model_and_resuming_changes_nothing(sphere, tmp_path, monkeypatch):
     whole = _train(sphere, steps=24)[0]
     assert torch.equal(whole.field.table, _train(sphere, steps=24)[0].field.table)
@@ -249,6 +251,7 @@ def test_of_many_views_the_near_ones_and_fewer_far_ones_are_compared():
     assert (away <= 10).sum() > (away >= 180).sum() > 0
 
 
+@pytest.mark.slow
 def test_from_directions_that_no_photo_has_colours_are_those_that_photos_agree_on():
     few = sphere_views(count=6, arc=np.pi / 3)
     errors = {share: _error_from_anywhere(few, share) for share in (0.0, NerfRecipe().turned_share)}

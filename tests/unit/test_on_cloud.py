@@ -99,6 +99,7 @@ def test_photos_come_to_lie_on_a_scan_that_their_gps_is_metres_off(tmp_path):
     assert value(content, "gps_residual_median_m") < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("extent", "most_m"),
     [
@@ -121,6 +122,7 @@ def test_a_scan_that_shows_next_to_nothing_of_the_scene_is_one_sentence(tmp_path
         laid(tmp_path, written(tmp_path, field(low=(-8, -6), high=(8, 6))))
 
 
+@pytest.mark.slow
 def test_heights_keep_the_name_of_their_zero_and_a_table_that_contradicts_the_file_is_refused(tmp_path):
     flown(tmp_path)
     content, _, report = laid(tmp_path, written(tmp_path, field(), "EPSG:32632+5773"))

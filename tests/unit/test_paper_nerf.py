@@ -54,6 +54,7 @@ def test_rank_punishes_the_wrong_order_only():
     assert rank(2.0, 1.0, apart=60.0) == 0.0
 
 
+@pytest.mark.slow
 def test_the_order_is_learned_beside_the_depths_that_it_is_of(sphere):
     """Both losses of the same maps, each with a scale of its own as monocular maps have, at the recipe's weights."""
     scales = 1 + 0.15 * torch.randn((12, 1, 1), generator=torch.Generator().manual_seed(2))

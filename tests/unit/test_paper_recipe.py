@@ -90,6 +90,7 @@ def test_the_papers_field_and_rays_are_taken_on_a_gpu_and_those_of_the_settings_
     assert on_cpu.recipe is nerf_stage.NERF
 
 
+@pytest.mark.slow
 def test_a_batch_holds_24_frames_and_the_last_one_the_rest(tmp_path):
     frames, sizes = frames_of(sideways_video(60), CPU), []
 
@@ -141,6 +142,7 @@ def _shifts_px(networks, frames, supervision):
     return frames.intrinsics[0, 0, 0] * moved[:, 0] / moved[:, 2]
 
 
+@pytest.mark.slow
 def test_depth_and_motion_are_learned_from_a_video_alone(tmp_path):
     frames = frames_of(sideways_video(), CPU)
     networks, supervision, losses = _trained(frames, tmp_path / "state.pt")
@@ -148,6 +150,7 @@ def test_depth_and_motion_are_learned_from_a_video_alone(tmp_path):
     assert float(_shifts_px(networks, frames, supervision).median()) == pytest.approx(-SHIFT_PX, abs=0.5)
 
 
+@pytest.mark.slow
 def test_fused_depth_refines_the_depth_network_however_far_off_it_is(tmp_path, wanted=0.7):
     """The video alone leaves it at 1.35, where depth and motion fit each other at any scale."""
     frames = frames_of(sideways_video(), CPU)
@@ -290,6 +293,7 @@ def ball(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_stages_run_from_sfm_poses_and_stage_3_goes_on_from_the_networks_of_stage_1(ball, tmp_path, monkeypatch):
     # A hash grid learns too little in a test's few steps at the paper's rate.
     fast = replace(nerf_stage.NERF, learning_rate=1e-2, grid_learning_rate=2e-2, rays_per_image=20, occupancy_cells=32)

@@ -97,6 +97,7 @@ def share_in(volume, points):
 CAPTURES = {"facade": (FACADE, along_a_facade), "statue": (STATUE, lambda: around_a_statue(16, 60))}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAPTURES)
 def test_photos_of_a_part_lose_nothing_of_the_object(name):
     boxes, photos = CAPTURES[name][0], CAPTURES[name][1]()

@@ -166,6 +166,7 @@ def test_an_unreadable_photo_is_named_and_nothing_is_written(tmp_path, content):
     assert not (tmp_path / "photos.json").exists()
 
 
+@pytest.mark.slow
 def test_a_photo_of_200_megapixels_is_read_and_one_that_no_camera_takes_is_refused(tmp_path, monkeypatch):
     (tmp_path / "p").mkdir()
     Image.new("1", (20_000, 10_000)).save(tmp_path / "p" / "phone.png")

@@ -34,6 +34,7 @@ def place_of(trial):
     return trial.scene_from_object.apply(trial.object.points).mean(0)
 
 
+@pytest.mark.slow
 def test_one_of_the_likely_places_is_the_object_without_its_ground(yard):
     def off(rows):
         return np.linalg.norm(np.median(yard.scene.points[rows], axis=0) - place_of(yard))

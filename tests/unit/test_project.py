@@ -54,6 +54,7 @@ def test_every_setting_is_described():
     assert [name for name, part in leaves(schema) if not part.get("description")] == []
 
 
+@pytest.mark.slow
 def test_schema_and_page_of_settings_are_not_stale(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["generate.py", "--check"])
     assert generate.main() == 0, "run `make docs`"
@@ -134,6 +135,7 @@ def test_no_job_asks_a_cluster_for_more_cores_than_its_smallest_node_may_have():
 TESTS = sorted(path for path in (ROOT / "tests").rglob("*.py") if "__pycache__" not in path.parts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", TESTS, ids=lambda path: str(path.relative_to(ROOT / "tests")))
 def test_a_test_uses_public_names_and_no_other_test_file(path):
     assert private_uses(ast.parse(path.read_text())) == []

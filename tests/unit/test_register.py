@@ -41,6 +41,7 @@ def in_files(content, trial, shift):
     return errors(found, truth, trial.object.points.mean(0), trial.diagonal)
 
 
+@pytest.mark.slow
 def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, house, capsys, monkeypatch):
     monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
     middle = house.object.points.mean(0)
@@ -87,6 +88,7 @@ def test_colours_are_evidence_only_where_they_were_compared(tmp_path, house, mon
     assert value(read_json(tmp_path / "out/transform.json"), "evidence") == "the clouds alone, by shape"
 
 
+@pytest.mark.slow
 def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path, monkeypatch):
     monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
     trial = plant("house", 5, noise=0.005, object_points=3000, density_ratio=1.0)
@@ -133,6 +135,7 @@ def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_pa
     assert sorted(p.name for p in out.iterdir()) == ["crop_box.html", "picture.png", "transform.json"]
 
 
+@pytest.mark.slow
 def test_two_runs_agree_bit_for_bit_and_origins_far_away_change_nothing(house):
     # Coordinates of few binary digits, so that moving them rounds nothing.
     near = Cloud(np.round(house.scene.points * 2**16) / 2**16, house.scene.normals, house.scene.colors)

@@ -62,6 +62,7 @@ def by_clouds(house):
     return refined(house, house.scene_from_object, settings=LITTLE[1])
 
 
+@pytest.mark.slow
 def test_a_planted_pose_is_found_and_accepted():
     trial = plant("balloon", 5, ground=False, noise=0.005, object_points=2000, density_ratio=1.0)
     ups = (trial.up_in_object, Z)
@@ -213,6 +214,7 @@ def registered(inputs, folder):
     register_object(inputs=inputs, **{key: folder / name for key, name in reports.items()}, seed=0, **settings)
 
 
+@pytest.mark.slow
 def test_the_stage_registers_and_reports_its_scale_and_hypotheses(tmp_path, house):
     inputs = stage_inputs(tmp_path, house.object, house.scene, house.up_in_object)
     registered(inputs, tmp_path)
@@ -284,6 +286,7 @@ def test_frame_ledger_chains_its_transforms(tmp_path):
         frame_ledger(pose, tmp_path / "o.json", None)
 
 
+@pytest.mark.slow
 def test_a_scale_at_the_edge_of_its_prior_is_refused(house):
     truth = house.scene_from_object
     scales = ScaleRange(truth.scale * np.exp(-0.3), 0.1)
@@ -309,6 +312,7 @@ def shared(pose: Sim3) -> Alignment:
     return Alignment(pose, Uncertainty.even(0.005, 0.3, 0.02))
 
 
+@pytest.mark.slow
 def test_photos_that_agree_settle_the_pose(house, by_clouds):
     truth = house.scene_from_object
     settings = replace(LITTLE[1], min_margin=1.0)
@@ -317,6 +321,7 @@ def test_photos_that_agree_settle_the_pose(house, by_clouds):
     assert linked.registered and linked.decided_by == "both"
 
 
+@pytest.mark.slow
 def test_of_photos_and_clouds_that_agree_the_less_uncertain_gives_the_pose(house):
     truth = house.scene_from_object
     near = Sim3(1.004, np.eye(3), np.zeros(3)) @ truth
@@ -327,6 +332,7 @@ def test_of_photos_and_clouds_that_agree_the_less_uncertain_gives_the_pose(house
         assert (outcome.ranked[0].pose.scale == near.scale) == by_photos
 
 
+@pytest.mark.slow
 def test_clouds_that_fit_as_well_at_the_pose_of_the_photos_are_as_uncertain_as_they_differ(house, by_clouds):
     truth, alone = house.scene_from_object, by_clouds
     apart = 4 * alone.uncertainty.translation_sd
@@ -360,6 +366,7 @@ def test_what_surfaces_have_wrong_alike_is_a_share_of_their_scatter_and_only_of_
     assert by_photos.ranked[0].pose is truth and by_photos.stated is by_photos.uncertainty
 
 
+@pytest.mark.slow
 def test_photos_at_whose_pose_the_clouds_lie_worse_must_be_that_much_less_uncertain(house, by_clouds):
     truth = house.scene_from_object
     beside = Sim3(1.0, np.eye(3), np.array([0.025 * house.diagonal, 0, 0])) @ truth
@@ -383,6 +390,7 @@ def test_photos_overrule_geometry_and_clouds_do_not_carry_their_pose_off(house):
     assert abs(scale) < 2 and angle < 2 and shift < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lift", "registered"), [(0.05, True), (0.3, False)])
 def test_a_pose_of_photos_that_the_scene_refutes_gives_way_to_a_near_one_that_the_clouds_find(house, lift, registered):
     truth, up = house.scene_from_object, lift * house.diagonal
@@ -400,6 +408,7 @@ def test_a_pose_of_photos_that_the_scene_refutes_gives_way_to_a_near_one_that_th
         assert abs(scale) < 2 and angle < 2 and shift < 0.02
 
 
+@pytest.mark.slow
 def test_an_object_in_the_scenes_free_space_is_refused(house):
     truth = house.scene_from_object
     assert house.free_space.violation(truth.apply(house.object.points)) < 0.05

@@ -71,6 +71,7 @@ def test_a_wall_that_slides_along_itself_and_a_box_do_not_repeat():
         assert shifts_onto_itself(prepare(sampled(parts, 20000, 0, 0.004), 0.06, 0, 12000), 0.06) == []
 
 
+@pytest.mark.slow
 def test_stairs_one_step_off_are_refused_where_the_scene_shows_some_of_their_steps():
     outcome = registered(stairs(0), between(stairs(1), 1.5, 4.8), STEP)
     decision = outcome.decision
@@ -79,12 +80,14 @@ def test_stairs_one_step_off_are_refused_where_the_scene_shows_some_of_their_ste
     assert decision.rival.source == "shifted" or outcome.ranked[0].source == "shifted"
 
 
+@pytest.mark.slow
 def test_a_row_shifted_by_one_of_many_bays_is_a_rival_and_no_turn_onto_itself():
     outcome = registered(row(24, 0), between(row(24, 1), 11, 37), 4 * BAY)
     assert not outcome.decision.registered and outcome.decision.margin < 0.1
     assert outcome.decision.free_axis is None
 
 
+@pytest.mark.slow
 def test_two_parts_of_a_row_that_overlap_little_are_not_laid_on_each_other():
     obj, scene = between(row(12, 0), 8.5, 23.3), between(row(12, 1), 1, 14.8)
     outcome = registered(obj, scene, -4 * BAY)
@@ -92,6 +95,7 @@ def test_two_parts_of_a_row_that_overlap_little_are_not_laid_on_each_other():
     assert "repeats itself every 2" in outcome.decision.reason
 
 
+@pytest.mark.slow
 def test_a_row_is_registered_where_the_scene_ends_where_it_does():
     obj = row(8, 0)
     outcome = registered(obj, row(8, 1), (0.05, 0.0, 0.0))
@@ -99,6 +103,7 @@ def test_a_row_is_registered_where_the_scene_ends_where_it_does():
     assert is_true(outcome, obj)
 
 
+@pytest.mark.slow
 def test_colours_tell_by_how_many_bays_a_row_is_shifted():
     def painted(points):
         paint = np.random.default_rng(0).integers(30, 220, (20, 3))

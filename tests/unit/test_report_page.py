@@ -451,6 +451,7 @@ def test_more_views_than_a_page_holds_get_fewer_points_each(tmp_path, monkeypatc
     assert len(counts) == 2 and all(700 < count <= 1000 for count in counts)
 
 
+@pytest.mark.slow
 def test_a_page_of_three_objects_and_a_scene_stays_below_15_mb(tmp_path, monkeypatch):
     rng, count = np.random.default_rng(0), VIEW_POINTS
     points = rng.normal(size=(count, 3))

@@ -54,6 +54,7 @@ def with_canopy():
     return hut(True, 0).transformed(TRUTH.inverse())
 
 
+@pytest.mark.slow
 def test_an_object_whose_distinctive_part_the_scene_lacks_is_rejected_for_its_half_turned_rival(with_canopy):
     outcome = register(with_canopy, hut(False, 1))
     decision, best = outcome.decision, outcome.ranked[0].pose
@@ -64,6 +65,7 @@ def test_an_object_whose_distinctive_part_the_scene_lacks_is_rejected_for_its_ha
     assert is_at(first, TRUTH, with_canopy) and is_at(second, TURNED, with_canopy)
 
 
+@pytest.mark.slow
 def test_the_same_object_is_registered_where_the_scene_shows_its_distinctive_part(with_canopy):
     outcome = register(with_canopy, hut(True, 1))
     assert outcome.decision.registered, outcome.decision.reason
@@ -71,12 +73,14 @@ def test_the_same_object_is_registered_where_the_scene_shows_its_distinctive_par
     assert is_at(outcome.decision.rival.pose, TURNED, with_canopy)
 
 
+@pytest.mark.slow
 def test_an_object_that_is_the_same_when_turned_is_registered_and_that_is_said():
     decision = register(hut(False, 0).transformed(TRUTH.inverse()), hut(False, 1)).decision
     assert decision.registered and abs(decision.free_axis @ UP) > 0.99
     assert "the object fits as well; its shape does not decide which turn is right" in decision.reason
 
 
+@pytest.mark.slow
 def test_colours_that_the_scene_does_not_have_do_not_choose_among_turns():
     plain = hut(False, 0)
     red = np.where(plain.points[:, :1] > 0, [[200, 30, 30]], [[30, 200, 30]]).astype(np.uint8)

@@ -150,6 +150,7 @@ def test_where_stereo_finds_nothing_either_the_error_says_so(bare):
         marked.read_masked_views(bare, bare / "masks", 0.8)
 
 
+@pytest.mark.slow
 def test_stereo_knows_that_something_without_sparse_points_hides_the_object():
     """A panel above the disc; no feature was found on it."""
     height = 0.25

@@ -458,6 +458,7 @@ def halves(path):
     Image.fromarray(picture).save(path, None if isinstance(path, Path) else "PNG")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "picture", "material"),
     [
@@ -503,6 +504,7 @@ def sides(path):
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", [True, False])
 @pytest.mark.parametrize("of", ["corners", "vertices", "faces"])
 def test_a_mesh_in_ply_has_the_colours_of_its_textures_or_faces(tmp_path, text, of):

@@ -45,6 +45,7 @@ def test_every_module_has_its_place_in_the_order():
     assert {part(".".join(path.relative_to(ROOT).with_suffix("").parts)) for path in modules()} == set(MAY_IMPORT)
 
 
+@pytest.mark.slow
 def test_imports_run_from_later_packages_to_earlier_ones():
     backwards = []
     for path in modules():
@@ -56,6 +57,7 @@ def test_imports_run_from_later_packages_to_earlier_ones():
     assert backwards == []
 
 
+@pytest.mark.slow
 def test_the_demo_stands_on_a_few_packages_and_no_package_imports_it():
     rendering = [path for path in (ROOT / "demo").glob("*.py") if path.stem != "evaluate"]
     used = {name for path in rendering for name in imported(path) if name.startswith("scenefuse")}
@@ -75,6 +77,7 @@ def test_the_core_of_the_nerf_imports_numpy_and_pytorch_only(name):
     assert ours <= OURS | {f"scenefuse.nerf.{other}" for other in CORE}
 
 
+@pytest.mark.slow
 def test_one_module_reads_colmap_models():
     readers = set()
     for path in modules():

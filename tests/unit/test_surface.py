@@ -97,6 +97,7 @@ def coarse():
     return make_mesh(cloud, [])
 
 
+@pytest.mark.slow
 def test_a_narrow_gap_is_bridged_on_the_surface_that_its_rim_goes_on_as(closed):
     bridged = closed.part(closed.classes == FaceClass.BRIDGED)
     assert away(bridged).max() < NARROW and 0.1 < bridged.areas().sum() / (np.pi * NARROW**2) < 1
@@ -164,6 +165,7 @@ def from_above(count: int = 4) -> list[View]:
     return views
 
 
+@pytest.mark.slow
 def test_a_gap_that_photos_see_through_stays_open(plate):
     bridges = []
     for surface in (plate, make_mesh(plate_over_ground(), from_above())):
@@ -180,6 +182,7 @@ def plane(gap: float, step: float = 0.02) -> Cloud:
     return with_hole(square, gap, np.zeros(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("height", "kind"), [(0.0, FaceClass.MEASURED), (0.3, None)])
 def test_a_wide_gap_is_measured_where_photos_confirm_the_surface_across_it_and_else_stays_open(height, kind):
     shift = Sim3(1.0, np.eye(3), np.array([0, 0, height]))
@@ -247,6 +250,7 @@ def test_another_reader_finds_metres_with_y_up_and_the_classes_in_the_glb(closed
     assert ((normals * middle).sum(1) > 0).mean() > 0.999
 
 
+@pytest.mark.slow
 def test_a_planted_picture_lands_on_the_faces_that_a_photo_shows_it_on(coarse):
     """Photos from two sides, in one of which the sphere is red on the left and blue on the right, another exposure."""
     views, pixels = from_above(3), []
@@ -339,6 +343,7 @@ def placed(coarse, tmp_path_factory):
     return ball_drawn(coarse, folder, georeference_json=folder / "g.json", facade=tuple(CORNERS.ravel()))
 
 
+@pytest.mark.slow
 def test_what_is_not_measured_is_grey_on_a_sheet_for_a_wall_may_be_white(drawings):
     sheet = np.asarray(Image.open(drawings / "south.png").convert("RGB"))
     nothing = rasterio.open(drawings / "south_class.tif").read(1) == NOTHING
@@ -366,6 +371,7 @@ def test_an_elevation_has_the_scale_that_it_says(drawings):
     assert (drawings / "drawings.pdf").read_bytes()[:4] == b"%PDF"
 
 
+@pytest.mark.slow
 def test_a_drawing_names_its_day_and_a_plan_its_crs_with_an_arrow_to_the_north(drawings, placed):
     def said(folder):
         return [page.get_textpage().get_text_bounded() for page in pypdfium2.PdfDocument(folder / "drawings.pdf")]
@@ -379,6 +385,7 @@ def test_a_drawing_names_its_day_and_a_plan_its_crs_with_an_arrow_to_the_north(d
         assert ("y taken for north" in plain) == (side != "above") and "y taken for north" not in page
 
 
+@pytest.mark.slow
 def test_a_plan_has_no_arrow_to_the_north_where_y_points_south_and_of_a_level_facade_one_looks_down(coarse, tmp_path):
     here = {"crs": quantity("EPSG:2048", ""), "origin_in_crs": quantity([1e4, 3.7e6, 300.0], "m")}
     write_json(tmp_path / "g.json", GEOREFERENCE | here)
@@ -450,6 +457,7 @@ def test_a_site_s_own_system_has_no_place_on_earth(tmp_path):
     assert earth_from_scene(tmp_path / "g.json") is None
 
 
+@pytest.mark.slow
 def test_a_scene_in_metres_is_drawn_from_above_in_the_feet_of_its_crs(coarse, tmp_path):
     place = {"latitude_deg": 37.5, "longitude_deg": -122.0, "altitude_m": 30.48006}
     known = {f"origin_{name}": quantity(number, "") for name, number in place.items()}
@@ -795,6 +803,7 @@ def test_a_report_on_paper_of_what_failed_says_so(tmp_path: Path):
     assert not any(list(page.get_objects([3])) for page in pages)
 
 
+@pytest.mark.slow
 def test_pictures_below_a_long_text_on_paper_go_on_on_a_new_page(tmp_path: Path):
     (tmp_path / "shed/figures").mkdir(parents=True)
     for name in ("before", "after"):

@@ -109,6 +109,7 @@ def fused(house, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_scene_in_laz_is_completed_by_a_cloud_of_unknown_scale(fused, house):
     out = fused / "out"
     before, after = read_cloud(fused / "yard.laz"), read_cloud(out / "completed.ply")
@@ -345,6 +346,7 @@ def test_a_refused_pose_leaves_no_completed_scene_and_nothing_of_an_earlier_run(
     assert "unregistered" in page and "The pose was refused" in page
 
 
+@pytest.mark.slow
 def test_a_refusal_ends_in_places_whose_boxes_can_be_pasted(tmp_path, house, monkeypatch, capsys):
     searched = registered_at_once(monkeypatch, house.scene_from_object, registered=False)
     rows = np.flatnonzero(house.scene.points[:, 0] > np.median(house.scene.points[:, 0]))

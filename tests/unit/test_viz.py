@@ -293,6 +293,7 @@ def test_an_object_by_itself_is_drawn_and_can_be_turned(capture, tmp_path):
     assert '<fieldset class="when" hidden>' in section and '<fieldset class="colour">' in section
 
 
+@pytest.mark.slow
 def test_figures_show_what_was_added(figures):
     names = {
         "missing.png",
@@ -309,6 +310,7 @@ def test_figures_show_what_was_added(figures):
         assert (colors[..., first] - colors[..., last] > 70).sum() > 50
 
 
+@pytest.mark.slow
 def test_stations_are_named_by_where_they_stand_if_north_is_known(capture, tmp_path, monkeypatch):
     labels = list[str]()
 
