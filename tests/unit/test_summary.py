@@ -468,8 +468,8 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
     card = re.sub("<.+?>", "", card).replace("\u00a0", " ")
     for sentence in (
         "11.4 m × 9.96 m, 8.10 m high, overall",
-        "98.2 % is there (in cells of 52.1 mm), 1.8 % is missing: 1.0 % seen by no photo, 0.8 % where photos disagree;"
-        " of the ground at its foot 1.2 % is missing",
+        "98.2 % is there (in cells of 52.1 mm), 1.8 % is missing: 1.0 % seen by no photo (estimated),"
+        " 0.8 % where photos disagree; of the ground at its foot 1.2 % is missing",
         "13.1 mm in the scene, the standard deviation of a point (two points in three are nearer)",
         "Photograph it from 3 places (results/objects/house/next_photos.csv): this would show 77 % of what no photo",
     ):
