@@ -117,7 +117,7 @@ def prepare(cloud: Cloud, voxel: float, seed: int, most: int) -> Surface:
     if len(thin) > most:
         thin = thin[np.sort(np.random.default_rng(seed).choice(len(thin), most, replace=False))]
     tree = cKDTree(thin.points)
-    neighbours = tree.query(thin.points, k=min(NORMAL_NEIGHBOURS, len(thin)), workers=threads())[1]
+    neighbours = nearest_rows(tree, thin.points, NORMAL_NEIGHBOURS)
     normals = plane_normals(thin.points, neighbours)
     outward = thin.points - thin.points.mean(0) if thin.normals is None else thin.normals
     normals = np.where(((normals * outward).sum(1) < 0)[:, None], -normals, normals)
@@ -129,8 +129,12 @@ def prepare(cloud: Cloud, voxel: float, seed: int, most: int) -> Surface:
 
 def normals_at(points: Array, places: Array) -> Array:
     """Normals (M, 3), on either side, of the planes through the points (N, 3) nearest to each of `places` (M, 3)."""
-    neighbours = cKDTree(points).query(places, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
-    return plane_normals(points, neighbours)
+    return plane_normals(points, nearest_rows(cKDTree(points), places, NORMAL_NEIGHBOURS))
+
+
+def nearest_rows(tree: cKDTree, places: Array, count: int) -> NDArray[np.int64]:
+    """(M, K) points nearest to each of `places` (M, 3): so many, or as many as there are."""
+    return np.asarray(tree.query(places, k=range(1, min(count, tree.n) + 1), workers=threads())[1])
 
 
 def with_queries(surface: Surface, count: int, seed: int = 0) -> Surface:
@@ -144,7 +148,7 @@ def with_queries(surface: Surface, count: int, seed: int = 0) -> Surface:
 def _color_slopes(surface: Surface, neighbours: int = 20) -> Array:
     """(N, 3 channels, 3) by least squares on each point's neighbours."""
     assert surface.colors is not None
-    index = surface.tree.query(surface.points, k=min(neighbours, len(surface)), workers=threads())[1]
+    index = nearest_rows(surface.tree, surface.points, neighbours)
     offset = surface.points[index] - surface.points[:, None]
     normals = surface.normals[:, None]
     offset = offset - (offset * normals).sum(2, keepdims=True) * normals

@@ -236,7 +236,7 @@ def _scene_points(path: Path, lines: Lines) -> ScenePoints:
                 f"{comma_advice(words)}"
             )
     names = [words[0] if len(words) == 4 else str(index) for index, (_, words) in enumerate(lines, 1)]
-    twice = next((name for name in names if names.count(name) > 1), None)
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise StageError(f"{path}: {twice} is given more than once; keep one line of it")
     return ScenePoints(path, names, np.array([[float(word) for word in words[-3:]] for _, words in lines]))

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.core.stage import threads
 from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3, Uncertainty
 from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, change_between, moved_about, similarity_rows
-from scenefuse.geometry.surface import SCORE_FRACTION, Surface
+from scenefuse.geometry.surface import SCORE_FRACTION, Surface, nearest_rows
 from scenefuse.register.score import MIN_COLOR_NOISE
 
 # Object points from which a scene point may come: those within two deviations, at the usual spacing and noise.
@@ -129,16 +128,15 @@ def explain(
     `partner` (N, K) are the nearest object points at this pose, where they are known already.
     """
     at = scene.points[scene.queries]
-    near = min(NEIGHBOURS, len(obj))
     if partner is None:
-        partner = obj.tree.query(pose.inverse().apply(at), k=near, workers=threads())[1].reshape(len(at), near)
+        partner = nearest_rows(obj.tree, pose.inverse().apply(at), NEIGHBOURS)
     residual = at[:, None] - pose.apply(obj.points[partner])
     off = (residual**2).sum(2) / (2 * noise.place**2)
     if _colored(obj, scene):
         off += (_color_residual(obj, scene, partner, noise) ** 2).sum(2) / (2 * noise.color**2)
     likelihood = np.exp(-off)
     # As many object points lie within reach of a scene point on a plane.
-    other = np.exp(-(MAX_DEVIATIONS**2) / 2) * min(near, 2 * np.pi * (noise.place / spacing) ** 2)
+    other = np.exp(-(MAX_DEVIATIONS**2) / 2) * min(partner.shape[1], 2 * np.pi * (noise.place / spacing) ** 2)
     total = likelihood.sum(1) + other
     return Explanation(partner, likelihood / total[:, None], residual, float(np.log(total).sum()))
 

@@ -11,7 +11,7 @@ from scenefuse.cloud.clouds import Cloud, sampled, within
 from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import Array, Sim3, apart
 from scenefuse.geometry.depth_test import FreeSpace
-from scenefuse.geometry.surface import NORMAL_NEIGHBOURS, SAMPLED_POINTS, Pairs, Surface, normals_at, pair
+from scenefuse.geometry.surface import NORMAL_NEIGHBOURS, SAMPLED_POINTS, Pairs, Surface, nearest_rows, normals_at, pair
 
 # Beta of the F-beta score: recall weighs more, since the scene shows only a part of the object.
 RECALL_WEIGHT = 2.0
@@ -109,8 +109,8 @@ def score(
 def displaced_share(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> float | None:
     """Share of the places shown by both clouds where one's surface lies in front of the other's, or behind it.
 
-    From each point the other cloud is looked up along the normal, both ways, for a surface that faces the same way:
-    where the object is, the two are one. None where no place is shown by both.
+    From each point the other cloud is looked up along the normal, both ways, for a surface that it meets or that faces
+    the same way: where the object is, the two are one. None where no place is shown by both.
 
     Args:
         obj: the object in its own frame.
@@ -127,9 +127,11 @@ def displaced_share(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: 
             distance, index = other.tree.query(places + step * tau * normals, distance_upper_bound=tau)
             hit = np.flatnonzero(np.isfinite(distance))
             normal, found = normals[hit], index[hit]
-            facing = (other.normals[found] * normal).sum(1) > MIN_FACING
+            facing = (other.normals[found] * normal).sum(1)
             off = np.abs(((other.points[found] - places[hit]) * normal).sum(1))
-            nearest[hit] = np.minimum(nearest[hit], np.where(facing, off, np.inf))
+            # Where two surfaces meet, the sides of their normals do not count: they may be estimated, or wrong.
+            facing = np.where(off <= tau, np.abs(facing), facing)
+            nearest[hit] = np.minimum(nearest[hit], np.where(facing > MIN_FACING, off, np.inf))
         shown += int(np.isfinite(nearest).sum())
         apart += int((nearest[np.isfinite(nearest)] > tau).sum())
     return apart / shown if shown else None
@@ -261,7 +263,7 @@ def self_consistency(points: Array) -> float:
     Measured at SAMPLED_POINTS points at most; neighbours and normals are those of the whole cloud.
     """
     tree, at = cKDTree(points), sampled(points, SAMPLED_POINTS, seed=0)
-    neighbours = tree.query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
+    neighbours = nearest_rows(tree, at, NORMAL_NEIGHBOURS)
     used, place = np.unique(neighbours, return_inverse=True)
     normals = normals_at(points, points[used])[place.reshape(neighbours.shape)]
     return float(np.abs(np.einsum("nk,njk->nj", normals[:, 0], normals[:, 1:])).mean())

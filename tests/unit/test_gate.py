@@ -368,6 +368,8 @@ def test_surfaces_that_lie_behind_each_other_are_displaced_and_those_that_meet_a
     assert displaced_share(OBLONG, OBLONG, alone, tau) == 0
     assert displaced_share(SQUARE, OBLONG, alone, tau) == pytest.approx(0.5, abs=0.15)
     assert displaced_share(OBLONG, SQUARE, shift(0, 50, 0), tau) is None
+    # Normals on the wrong side displace nothing that meets.
+    assert displaced_share(OBLONG, replace(OBLONG, normals=-OBLONG.normals), alone, tau) == 0
 
 
 @pytest.mark.slow

@@ -1,3 +1,4 @@
+import time
 import unicodedata
 from dataclasses import replace
 
@@ -173,6 +174,14 @@ def test_bad_files(tmp_path, text, sentence):
     path.write_text(text)
     with pytest.raises(StageError, match=sentence):
         read_points(path)
+
+
+def test_any_cloud_marks_an_object_in_time_that_grows_with_its_points(tmp_path):
+    rows = np.arange(120_000.0).reshape(-1, 3)
+    np.savetxt(tmp_path / "marks.xyz", rows)
+    start = time.process_time()
+    assert np.array_equal(read_points(tmp_path / "marks.xyz").positions, rows)
+    assert time.process_time() - start < 20
 
 
 def test_a_file_from_a_spreadsheet_is_read_as_the_tables_are(tmp_path):

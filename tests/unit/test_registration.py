@@ -106,6 +106,11 @@ def test_the_true_pose_scores_higher_than_a_turned_one(house):
     assert right.color > 0.9 > wrong.color
 
 
+def test_an_object_that_is_small_beside_a_voxel_of_a_wide_scene_has_no_hypothesis(house):
+    problem = Problem(house.object, house.scene, ScaleRange(1e-3 * house.scene_from_object.scale, 0.1))
+    assert find_hypotheses(problem, CoarseSettings(ransac_samples=1000, feature_scale_steps=1)) == []
+
+
 def test_refinement_recovers_a_disturbed_similarity(house):
     obj, scene = surfaces(house, 0.15)
     truth, centre = house.scene_from_object, house.object.points.mean(0)
