@@ -110,7 +110,7 @@ def refine_on_cloud(own: Array, points: Array) -> Sim3:
     """The similarity that lays a model's own points (M, 3) on a cloud (N, 3), both nearly in the same place.
 
     Point to plane (Chen and Medioni 1992), of the nearest 70 % at each step (trimmed ICP, Chetverikov et al. 2005); a
-    plane is fitted to the neighbours in the cloud.
+    plane is fitted to the neighbours in the cloud. What a flat cloud leaves open stays, by weak point-to-point rows.
     """
     own, tree, found = own[:: max(1, len(own) // SAMPLED_POINTS)], cKDTree(points), Sim3.identity()
     for _ in range(20):
@@ -118,7 +118,15 @@ def refine_on_cloud(own: Array, points: Array) -> Sim3:
         distance, near = tree.query(moved, NEIGHBOURS, workers=threads())
         rows = np.argsort(distance[:, 0])[: max(NEIGHBOURS, int(NEAREST_SHARE * len(own)))]
         normals, middle = plane_normals(points, near[rows]), points[near[rows]].mean(1)
-        found = step_to_planes(found, moved[rows], normals, ((moved[rows] - middle) * normals).sum(1))
+        moved = moved[rows]
+        off = ((moved - middle) * normals).sum(1)
+        # Levers end on the planes: noise of the model beside a flat cloud is no relief, which a smaller scale fits.
+        places = [moved - off[:, None] * normals, *[moved] * 3]
+        # Half the weight: beside a cloud's border the nearest points lie inwards.
+        axes = POINT_WEIGHT / 2 * np.eye(3)
+        along = np.concatenate([normals, *(np.broadcast_to(axis, moved.shape) for axis in axes)])
+        apart = np.concatenate([off, *((moved - points[near[rows, 0]]) @ axes).T])
+        found = step_to_planes(found, np.concatenate(places), along, apart)
     return found
 
 

@@ -11,8 +11,10 @@ from support.surveyed import FRAME, fly, gcp_lines, write_inputs
 from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.core.transforms import Sim3
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import CropInputs, crop_scene
+from scenefuse.geometry.icp import refine_on_cloud
 from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.given_cloud import import_posed_cloud
 from scenefuse.georef.placement import GeoreferenceSettings
@@ -193,3 +195,18 @@ def test_photos_that_nothing_places_are_one_sentence(tmp_path):
     with pytest.raises(StageError, match="nothing says where the photos lie in .*scan.laz: 0 registered photos"):
         laid(tmp_path, written(tmp_path, field()))
     assert not (tmp_path / "georeferenced").exists()
+
+
+@pytest.mark.parametrize("relief", [1.0, 0.0], ids=["hilly", "flat"])
+def test_a_model_s_noise_is_no_relief_by_which_a_cloud_shrinks_it(relief):
+    rng = np.random.default_rng(0)
+    (x, y), (u, v) = (rng.uniform((-r, -r), (r, r), (n, 2)).T for r, n in ((50, 30000), (40, 300)))
+    cloud, own = (np.stack([x, y, relief * (3 * np.sin(x / 15) + 2 * np.cos(y / 11))], 1) for x, y in ((x, y), (u, v)))
+    own += rng.normal(0, [0.03, 0.03, 0.2], own.shape)
+    start = Sim3(1.01, np.eye(3), np.array([1.0, -0.5, 0.3]))
+    found = refine_on_cloud(start.apply(own), cloud + rng.normal(0, 0.01, cloud.shape)) @ start
+    off = found.apply(np.zeros(3))
+    # What the flat cloud does not say stays as it was.
+    wanted, most = (Sim3.identity(), 0.3) if relief else (start, 0.6)
+    assert np.log(found.scale / wanted.scale) == pytest.approx(0.0, abs=0.006)
+    assert np.abs(off - wanted.translation)[:2].max() < most and abs(off[2]) < 0.1
