@@ -28,6 +28,8 @@ from scenefuse.two_clouds.places import MAX_PLACES, likely_places
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
 SEARCHED_POINTS = 500_000
+# How many times as large as the scene's part that shows it an object may be, and as that part's spacing it has to be.
+MAX_SIZE_RATIO = 10.0
 Direction = tuple[float, float, float]
 
 
@@ -237,10 +239,13 @@ def find_in_scene(
     progress("searching all of it")
     searched = [(search(obj, scene, settings, seed, ups, scales), scene)]
     likely = [] if marked else likely_places(obj, scene, up_in_scene, settings.crop, seed, MAX_PLACES)
-    for number, rows in enumerate(likely, 1):
-        progress(f"searching part {number} of {len(likely)} that look like the object")
+    # At a known scale the object may be far larger than a part; grids of nearest points would be as well.
+    smallest = 0.0 if scales is None else scales.centre * obj.diagonal / MAX_SIZE_RATIO
+    parts = [part for part in (scene[rows] for rows in likely) if part.diagonal > smallest]
+    for number, part in enumerate(parts, 1):
+        progress(f"searching part {number} of {len(parts)} that look like the object")
         with contextlib.suppress(StageError):  # too few different points there
-            searched.append((search(obj, scene[rows], settings, seed, ups, scales), scene[rows]))
+            searched.append((search(obj, part, settings, seed, ups, scales), part))
     # The refinement of a pose does not catch up with one that is twice as good.
     least = max(there.total for there, _ in searched) / 2
     best = sorted((one for one in searched if one[0].total >= least), key=lambda one: -one[0].total)

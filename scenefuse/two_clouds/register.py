@@ -25,6 +25,7 @@ from scenefuse.register.register_object import draw_alignment
 from scenefuse.report.view import REACH
 from scenefuse.two_clouds.complete import complete, fusion_settings, write_files
 from scenefuse.two_clouds.find import (
+    MAX_SIZE_RATIO,
     Known,
     Registration,
     RegistrationSettings,
@@ -38,8 +39,6 @@ from scenefuse.two_clouds.find import (
 from scenefuse.two_clouds.page import write_box_page, write_page
 
 NOTHING = Known()
-# How many times as large as the scene's part that shows it an object may be, and as that part's spacing it has to be.
-MAX_SIZE_RATIO = 10.0
 # Points of the part of a scene in which an object is searched: of many more, some are left out.
 MAX_SEARCHED_POINTS = 1 << 22
 # What a refusal ends in.
@@ -293,8 +292,8 @@ def _check_size(scales: ScaleRange, given: Given) -> None:
     if across > MAX_SIZE_RATIO * part or across < MAX_SIZE_RATIO * step:
         raise StageError(
             f"at a scale of {most:.4g} the object would be {across:.4g} across, and the searched part of the scene is"
-            f" {part:.4g}, its points {step:.4g} apart; correct --scale or --scale-range: scene units per object unit"
-            " (1000 from metres to millimetres)"
+            f" {part:.4g}, its points {step:.4g} apart; correct --scale or --scale-range, scene units per object unit"
+            " (1000 from metres to millimetres), or mark the part that shows the object (--crop-box)"
         )
 
 

@@ -84,6 +84,19 @@ def test_the_best_place_that_passes_the_gate_is_taken(monkeypatch, yard):
     assert found.outcome.decision.margin == pytest.approx(0.25)
 
 
+def test_at_a_known_scale_parts_that_are_far_smaller_than_the_object_are_not_searched(monkeypatch, yard):
+    searched = []
+    monkeypatch.setattr(register, "search", lambda obj, scene, *known: searched.append(scene) or tried(0.1, [0, 0, 0]))
+    monkeypatch.setattr(register, "refined", lambda found, *known: found)
+    monkeypatch.setattr(register, "with_agreement", lambda found, *known: found)
+    monkeypatch.setattr(register, "likely_places", lambda *known: [np.arange(300)])
+    size = yard.scene[np.arange(300)].diagonal / yard.object.diagonal
+    for scale, count in ((9 * size, 2), (11 * size, 1)):
+        searched.clear()
+        find_in_scene(yard.object, yard.scene, LITTLE, 0, scales=ScaleRange(scale, 0.0))
+        assert len(searched) == count
+
+
 def test_an_object_that_fits_two_places_is_refused(monkeypatch, yard):
     far = [3 * yard.object.diagonal, 0, 0]
     for passes in (True, False):
