@@ -73,6 +73,7 @@ def project(tmp_path, snakemake, request):
             noise = np.random.default_rng(index).integers(0, 255, (48, 64, 3), dtype=np.uint8)
             cv2.imwrite(str(tmp_path / name / f"{index}.jpg"), noise)
             os.utime(tmp_path / name / f"{index}.jpg", (1e9, 1e9))
+    shutil.copy(tmp_path / "barn/2.jpg", tmp_path / "spare.jpg")
     (tmp_path / "barn/2.jpg").write_bytes(b"\xff\xd8\xff\xe0 broken")
     (tmp_path / "scenes.tsv").write_text("scene\tphotos\nyard\tflight\n")
     rows = [f"{name}\tyard\t{name}\tclicks.tsv\tprompts.tsv" for name in ("shed", "barn")]
@@ -118,7 +119,7 @@ def test_a_failed_object_keeps_nobody_back_and_is_taken_in_once_it_is_mended(pro
     assert handed.returncode == 0, handed.stdout[-3000:]
 
     # As if the barn's stages had run after its photo was mended.
-    shutil.copy(tmp_path / "barn/1.jpg", tmp_path / "barn/2.jpg")
+    shutil.copy(tmp_path / "spare.jpg", tmp_path / "barn/2.jpg")
     os.utime(tmp_path / "barn/2.jpg", (1e9, 1e9))
     write_stages(tmp_path, [f for f in project.files if "/barn/" in f and "/crop." not in f], 1.2e9)
     frames = [f"results/objects/barn/{name}" for name in ("frames", "photos.json")]

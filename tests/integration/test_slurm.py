@@ -40,7 +40,7 @@ RUN = """
 {snakemake} --snakefile slow/Snakefile --directory slow &> slow.txt &
 {snakemake} --snakefile card/Snakefile --directory card --set-resources card:slurm_partition=cards &> card.txt &
 for _ in $(seq 1200); do [ -s slow/started ] && break; sleep 0.1; done
-scontrol update JobId=$(cat slow/started) EndTime=now
+until scontrol update JobId=$(cat slow/started) EndTime=now; do sleep 0.1; done  # not in the second of its start
 wait %1 && echo 0 > clouds.status || echo $? > clouds.status
 wait %2 && echo 0 > slow.status || echo $? > slow.status
 wait %3 && echo 0 > card.status || echo $? > card.status

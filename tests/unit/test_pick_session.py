@@ -34,7 +34,8 @@ def opened(project, name="shed"):
 def test_an_object_has_its_prompts_and_the_marks_in_its_scene(yard):
     first, second, _ = opened(yard).tables
     assert (first.document.path.name, second.document.path.name) == ("prompts.tsv", "clicks.tsv")
-    assert list(first.pictures) == [f"{k}.jpg" for k in range(5)] and len(second.pictures) == 3
+    for table, folder in ((first, "close"), (second, "flight")):
+        assert [str(picture.path) for picture in table.pictures.values()] == [f"{folder}/{k}.jpg" for k in range(5)]
     assert first.sizes["0.jpg"] == (64, 48) and first.listed and first.cameras is None
 
 
