@@ -110,21 +110,24 @@ def segment_again(
     with the hull, or much more than most, unless clicks alone suffice for it; again with the hull of the masks that
     this changed, and then all at the photo's resolution.
 
-    A mask that holds points of something else, by the `votes` (P,) of the first masks, as of a tree before a wall, is
-    not taken.
+    A mask that holds points of something else, as of a tree before a wall, is not taken: by the `votes` (P,) of the
+    first masks on what photos see whose masks agree with the hull.
     """
     masks = list(masks)
+    certain = tuple(photos.views[k].name for k, clicks in clicked.items() if clicks.enough)
     for _ in range(MAX_ROUNDS):
-        hull = carve_consistent(target, photos.views, masks, settings, MAX_WRONG_SHARE)
+        hull = carve_consistent(target, photos.views, masks, settings, MAX_WRONG_SHARE, certain)
         outlines = [silhouette(hull, view) for view in photos.views]
         agreement = [mask_iou(mask, outline) for mask, outline in zip(masks, outlines)]
         least = max(settings.min_agreement, MIN_SHARE_OF_MEDIAN * float(np.median(agreement)))
-        changed = False
+        trusted, changed = np.zeros(len(photos.points), np.int8), False
+        for rows in (photos.seen[k] for k in np.flatnonzero(np.array(agreement) >= settings.min_agreement)):
+            trusted[rows] = 0 if votes is None else votes[rows]
         for k, (view, outline) in enumerate(zip(photos.views, outlines)):
-            final = masks[k].any() and k in clicked and clicked[k].enough
+            final = masks[k].any() and view.name in certain
             if outline.any() and agreement[k] < least and not final:
                 again = segment_like(network, target, view, outline, clicked.get(k, NO_CLICKS))
-                held = np.zeros(0) if votes is None else votes[points_held(photos, k, again)]
+                held = trusted[points_held(photos, k, again)]
                 foreign = np.count_nonzero(held) >= MIN_KNOWN_POINTS and np.mean(held[held != 0] > 0) < MIN_AGREEMENT
                 if mask_iou(again, outline) > agreement[k] and not foreign:
                     masks[k], changed = again, True
@@ -148,7 +151,7 @@ def score_masks(
 ) -> ScoredMasks:
     """The masks of V views with their agreement with their visual hull; empty and contradicting ones are dropped, but
     not those that a person clicked, by the names of their photos."""
-    hull = carve_consistent(target, views, masks, settings, MAX_WRONG_SHARE)
+    hull = carve_consistent(target, views, masks, settings, MAX_WRONG_SHARE, clicked)
     scores = {view.name: mask_iou(mask, silhouette(hull, view)) for view, mask in zip(views, masks)}
     dropped = {}
     for view, mask in zip(views, masks):
@@ -160,12 +163,19 @@ def score_masks(
 
 
 def carve_consistent(
-    target: Target, views: list[View], masks: list[Mask], settings: MaskSettings, tolerance: float
+    target: Target,
+    views: list[View],
+    masks: list[Mask],
+    settings: MaskSettings,
+    tolerance: float,
+    certain: tuple[str, ...] = (),
 ) -> Hull:
     """The visual hull of the largest set of masks (H, W) that agree with the hull of their set.
 
     A strict hull of all masks is too small where some lack a part, a tolerant one too large where few photos bound it;
-    the set that begins with the one or the other is taken, and all masks where no two agree.
+    the larger set of those that begin with the one and the other is taken, and all masks where no two agree. Where it
+    contradicts a mask that a person clicked, by the names of their photos in `certain`, a third grows from these
+    outwards, by each nearest photo whose mask agrees with a hull that these agree with.
 
     Raises:
         StageError: the masks have nothing in common.
@@ -176,15 +186,24 @@ def carve_consistent(
     def carved(among: list[View], voxels: int, share: float) -> Hull:
         return carve(target.box, target.ground.height_of, among, voxels, share, own)
 
-    def agreeing(hull: Hull) -> list[View]:
-        return [view for view in shown if mask_iou(view.pixels, silhouette(hull, view)) >= settings.min_agreement]
+    def agreeing(hull: Hull, among: list[View]) -> list[View]:
+        return [view for view in among if mask_iou(view.pixels, silhouette(hull, view)) >= settings.min_agreement]
 
     largest: list[View] = []
     coarse = settings.hull_voxels // 2  # enough to compare by, in an eighth of the time
     for share in (MAX_LACKING_SHARE, tolerance):
-        chosen = agreeing(carved(shown, coarse, share)) if len(shown) > 1 else []
-        consistent = agreeing(carved(chosen, coarse, tolerance)) if len(chosen) > 1 else []
+        chosen = agreeing(carved(shown, coarse, share), shown) if len(shown) > 1 else []
+        consistent = agreeing(carved(chosen, coarse, tolerance), shown) if len(chosen) > 1 else []
         largest = max(largest, consistent, key=len)
+    clicked = [view for view in shown if view.name in certain]
+    if not {view.name for view in largest}.issuperset(view.name for view in clicked):
+        centres, grown = np.array([view.centre for view in clicked]), list(clicked)
+        others = [view for view in shown if view.name not in certain]
+        for view in sorted(others, key=lambda one: np.linalg.norm(centres - one.centre, axis=1).min()):
+            needed = [*clicked, view]
+            if len(agreeing(carved([*grown, view], coarse, tolerance), needed)) == len(needed):
+                grown.append(view)
+        largest = max(largest, grown, key=len)
     hull = carved(largest if len(largest) > 1 else shown, settings.hull_voxels, tolerance)
     if len(hull.shell) == 0:
         raise StageError(

@@ -20,7 +20,7 @@ from support.planted_ball import (
 )
 
 from scenefuse.core.stage import StageError
-from scenefuse.geometry.visual_hull import mask_iou
+from scenefuse.geometry.visual_hull import mask_iou, silhouette
 from scenefuse.masks import segmentation
 from scenefuse.masks.grabcut import along_edges, grow_seeds, query_grabcut
 from scenefuse.masks.prompts import NO_PIXELS, Prompts, far_apart, overlap
@@ -473,12 +473,37 @@ def test_a_mask_made_again_is_not_taken_where_it_holds_what_other_masks_leave_ou
         assert again[8].any() == taken
 
 
+def test_what_only_photos_with_wrong_masks_see_rejects_no_mask(photos):
+    masks = [true_mask(view) for view in photos.views]
+    masks[8] = np.zeros_like(masks[8])
+    others = [~np.isin(rows, photos.seen[8]) | (k == 8) for k, rows in enumerate(photos.seen)]
+    apart = replace(
+        photos,
+        seen=[rows[chosen] for rows, chosen in zip(photos.seen, others)],
+        seen_at=[at[chosen] for at, chosen in zip(photos.seen_at, others)],
+    )
+    votes = np.full(len(photos.points), -1, np.int8)
+    assert segment_again(BallNetwork(photos), of_points(photos), masks, apart, COARSE, votes=votes)[8].any()
+
+
+def test_where_most_masks_agree_on_nothing_the_hull_grows_from_the_clicked_one(photos):
+    u, v = np.meshgrid(np.arange(WIDTH) - WIDTH / 2, np.arange(HEIGHT) - HEIGHT / 2)
+    masks = [true_mask(view) for view in photos.views]
+    for k in range(5, PHOTOS):
+        masks[k] = np.hypot(u - 18 * np.cos(2 * k), v - 18 * np.sin(2 * k)) < 6
+    carved = partial(carve_consistent, of_points(photos), photos.views, masks, COARSE, 0.1)
+    with pytest.raises(StageError, match="no common object"):
+        carved()
+    hull = carved((photos.views[2].name,))
+    assert all(mask_iou(silhouette(hull, view), true_mask(view)) > 0.9 for view in photos.views[:5])
+
+
 def test_masks_are_made_again_by_the_hull_of_those_that_were_made_again(photos, monkeypatch):
     rounds = []
 
-    def carved(target, views, masks, settings, tolerance):
+    def carved(target, views, masks, *rest):
         rounds.append([mask.any() for mask in masks])
-        return carve_consistent(target, views, masks, settings, tolerance)
+        return carve_consistent(target, views, masks, *rest)
 
     monkeypatch.setattr(segmentation, "carve_consistent", carved)
     masks = [true_mask(view) for view in photos.views]
