@@ -110,8 +110,8 @@ def segment_again(
     with the hull, or much more than most, unless clicks alone suffice for it; again with the hull of the masks that
     this changed, and then all at the photo's resolution.
 
-    A mask that holds points of something else, as of a tree before a wall, is not taken: by the `votes` (P,) of the
-    first masks on what photos see whose masks agree with the hull.
+    A mask that holds points of something else, by the `votes` (P,) of the first masks, as of a tree before a wall, is
+    not taken.
     """
     masks = list(masks)
     certain = tuple(photos.views[k].name for k, clicks in clicked.items() if clicks.enough)
@@ -120,14 +120,12 @@ def segment_again(
         outlines = [silhouette(hull, view) for view in photos.views]
         agreement = [mask_iou(mask, outline) for mask, outline in zip(masks, outlines)]
         least = max(settings.min_agreement, MIN_SHARE_OF_MEDIAN * float(np.median(agreement)))
-        trusted, changed = np.zeros(len(photos.points), np.int8), False
-        for rows in (photos.seen[k] for k in np.flatnonzero(np.array(agreement) >= settings.min_agreement)):
-            trusted[rows] = 0 if votes is None else votes[rows]
+        changed = False
         for k, (view, outline) in enumerate(zip(photos.views, outlines)):
             final = masks[k].any() and view.name in certain
             if outline.any() and agreement[k] < least and not final:
                 again = segment_like(network, target, view, outline, clicked.get(k, NO_CLICKS))
-                held = trusted[points_held(photos, k, again)]
+                held = np.zeros(0) if votes is None else votes[points_held(photos, k, again)]
                 foreign = np.count_nonzero(held) >= MIN_KNOWN_POINTS and np.mean(held[held != 0] > 0) < MIN_AGREEMENT
                 if mask_iou(again, outline) > agreement[k] and not foreign:
                     masks[k], changed = again, True

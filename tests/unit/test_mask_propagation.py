@@ -473,19 +473,6 @@ def test_a_mask_made_again_is_not_taken_where_it_holds_what_other_masks_leave_ou
         assert again[8].any() == taken
 
 
-def test_what_only_photos_with_wrong_masks_see_rejects_no_mask(photos):
-    masks = [true_mask(view) for view in photos.views]
-    masks[8] = np.zeros_like(masks[8])
-    others = [~np.isin(rows, photos.seen[8]) | (k == 8) for k, rows in enumerate(photos.seen)]
-    apart = replace(
-        photos,
-        seen=[rows[chosen] for rows, chosen in zip(photos.seen, others)],
-        seen_at=[at[chosen] for at, chosen in zip(photos.seen_at, others)],
-    )
-    votes = np.full(len(photos.points), -1, np.int8)
-    assert segment_again(BallNetwork(photos), of_points(photos), masks, apart, COARSE, votes=votes)[8].any()
-
-
 def test_where_most_masks_agree_on_nothing_the_hull_grows_from_the_clicked_one(photos):
     u, v = np.meshgrid(np.arange(WIDTH) - WIDTH / 2, np.arange(HEIGHT) - HEIGHT / 2)
     masks = [true_mask(view) for view in photos.views]
