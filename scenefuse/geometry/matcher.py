@@ -122,18 +122,22 @@ class Matcher:
         return supported_mean(values, self.weights)
 
     def shifts(self, low: float, high: float) -> list[float]:
-        """Shift in each source photo, in its pixels, between two inverse depths; 0 where both never lie in it."""
+        """Shift in each source photo, in its pixels, between two inverse depths, or ever shorter parts of their range
+        where none of its pixels has both in the photo; 0 where a 64th still leads out of it."""
         shifts = []
         for gray, turn, move in self.sources:
             half = torch.tensor([gray.shape[-1] / 2, gray.shape[-2] / 2], device=gray.device)
             thinned = self._directions(turn, 8)
-            ends = []
-            for inverse in (low, high):
-                p = thinned + move[:, None, None] * inverse
-                ends.append(p[:2] / p[2].clamp(min=1e-6))
-            inside = (ends[0].abs().amax(0) < 1) & (ends[1].abs().amax(0) < 1)
+            for part in 0.5 ** np.arange(7):
+                ends = []
+                for inverse in (low, low + part * (high - low)):
+                    p = thinned + move[:, None, None] * inverse
+                    ends.append(p[:2] / p[2].clamp(min=1e-6))
+                inside = (ends[0].abs().amax(0) < 1) & (ends[1].abs().amax(0) < 1)
+                if inside.any():
+                    break
             length = ((ends[1] - ends[0]) * half[:, None, None]).norm(dim=0)
-            shifts.append(float(length[inside].median()) if inside.any() else 0.0)
+            shifts.append(float(length[inside].median()) / part if inside.any() else 0.0)
         return shifts
 
 

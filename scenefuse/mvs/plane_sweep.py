@@ -59,7 +59,7 @@ class DepthMapSettings:
     best_sources: int = 3
     """The best so many sources of a hypothesis count; the others are taken as occluded (torch only)."""
     planes: int = 96
-    """At most so many inverse-depth hypotheses in the sweep (torch only)."""
+    """At most so many inverse-depth hypotheses in the sweep, unless more than two pixels apart (torch only)."""
     window_px: int = 7
     """Side of the matching window in pixels, odd."""
     smoothness: float = 0.1
@@ -158,7 +158,8 @@ def refine_by_matching(
 def _sweep(matcher: Matcher, low: float, high: float, settings: DepthMapSettings) -> tuple[Tensor, float]:
     """Inverse depth per pixel, (h, w), by a fronto-parallel sweep with semi-global smoothing, and the plane step."""
     shift = max(matcher.shifts(low, high))
-    count = int(np.clip(math.ceil(shift / 0.75), 16, settings.planes))
+    # Between planes more than two pixels apart no window matches; but a wrong range may be as long as it likes.
+    count = int(np.clip(math.ceil(shift / 0.75), 16, max(settings.planes, min(shift / 2, 4 * settings.planes))))
     planes = torch.linspace(low, high, count, device=matcher.reference.device)
     height, width = matcher.reference.shape
     cost = torch.empty(height, width, count)

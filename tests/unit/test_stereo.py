@@ -105,6 +105,15 @@ def test_a_textured_wall_keeps_its_depth():
     assert np.quantile(angle[wall & (estimate.depth > 0)], 0.9) < 8
 
 
+@pytest.mark.parametrize("near", [1.0, 0.6])
+def test_something_right_before_the_camera_costs_no_depth_behind_it(near):
+    """A plant, or a fence: at its depth most of each photo lies outside the others, and 20 planes are far apart."""
+    views, card = photos(texture(0, 0.05, 0.35), texture(1, 0.55, 0.65), noise=1.0)
+    depth = estimate_depth(views[0], views[1:], near, 14.0, replace(SETTINGS, planes=20), "cpu").depth
+    assert (np.abs(depth - CARD) < 0.2)[card].mean() > 0.9
+    assert (np.abs(depth - WALL) < 0.2)[inner() & ~grown(card, 12)].mean() > 0.9
+
+
 LIMITS = {"max_depth_error": 0.01, "max_reprojection_px": 2.0, "max_normal_error_deg": 30.0}
 
 
