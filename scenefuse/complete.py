@@ -216,7 +216,8 @@ def _run_workflow(project: Path, targets: list[str], cores: int | None) -> None:
                 for line in read:
                     report_step(project, line.rstrip(), started, cores)
         except BaseException:
-            process.send_signal(signal.SIGINT)
+            # Its jobs, too, as a terminal does: Snakemake waits for them until they end by themselves.
+            os.killpg(process.pid, signal.SIGINT)
             process.wait()
             raise
     if process.returncode:

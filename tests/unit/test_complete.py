@@ -217,11 +217,17 @@ def test_a_run_that_fails_says_why_in_one_sentence(two_folders, workflow, said, 
         run("close", prompts=(Path("clicks.tsv"),))
 
 
-def test_an_interrupt_ends_snakemake_once_and_in_its_own_way(two_folders, workflow, monkeypatch):
+def test_an_interrupt_ends_snakemake_once_in_its_own_way_and_its_jobs(two_folders, workflow, monkeypatch):
     workflow(
-        "import signal, pathlib, sys, time\n"
-        "signal.signal(signal.SIGINT, lambda *_: (pathlib.Path('ended').write_text('x'), sys.exit(1)))\n"
-        "print('Job 1: a', flush=True)\ntime.sleep(60)"
+        "import os, signal, pathlib, sys\n"
+        "signal.signal(signal.SIGINT, lambda *_: None)\n"
+        "job = os.fork()\n"
+        "if not job:\n"
+        "    signal.signal(signal.SIGINT, lambda *_: os._exit(3))\n"
+        "    print('Job 1: a', flush=True)\n"
+        "    signal.pause()\n"
+        "pathlib.Path('ended').write_text(str(os.waitstatus_to_exitcode(os.waitpid(job, 0)[1])))\n"
+        "sys.exit(1)"
     )
 
     def interrupted(*_):
@@ -230,7 +236,7 @@ def test_an_interrupt_ends_snakemake_once_and_in_its_own_way(two_folders, workfl
     monkeypatch.setattr(complete, "report_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run("close", prompts=(Path("clicks.tsv"),))
-    assert Path("flight_completed/ended").read_text() == "x"
+    assert Path("flight_completed/ended").read_text() == "3"
 
 
 def test_the_time_left_follows_what_jobs_took_so_far(tmp_path):
