@@ -88,9 +88,12 @@ def compare(obj: Measured, scene: Measured, disputed: Mask, views: list[View], s
     through = seen.through >= np.maximum(MIN_AGREEING, THROUGH_SHARE * is_open)
     reason[through & ~scene.surface] = Reason.SEEN_THROUGH
 
-    both = concatenate([surface, scene.cloud[scene.surface]])
-    behind = see(obj.cloud.points, both, views, spacing(both.points), MARGIN * diagonal)
-    contradicted = ~obj.surface & (behind.through >= MIN_AGREEING)
+    sides = [surface, scene.cloud[scene.surface]]
+    both, contradicted = concatenate(sides), ~obj.surface
+    loose = obj.cloud.points[contradicted]
+    # In cells as fine as one side's points the other, sparser one has holes.
+    behind = [see(loose, both, views, spacing(side.points), MARGIN * diagonal).through for side in sides]
+    contradicted[contradicted] = np.maximum(*behind) >= MIN_AGREEING
 
     worse, better = better_measured(obj, scene, diagonal, share)
     reason[worse & (reason == Reason.KEPT)] = Reason.REPLACED

@@ -102,6 +102,15 @@ def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_
     assert not found.added[last].any() and found.contradicted[last].all()
 
 
+def test_photos_see_through_an_object_to_a_scene_whose_points_are_far_sparser(near):
+    floating = sheet(0.2, 0.5, 0.02, z=0.3, half=0.2)
+    obj, scene = concatenate([sheet(-0.8, 0.0, 0.02), floating]), sheet(-0.8, 0.8, 0.12)
+    last = np.arange(len(obj)) >= len(obj) - len(floating)
+    sides = known(obj, 0.002, ~last), known(scene, 0.002)
+    found = compare.compare(*sides, np.zeros(len(scene), bool), near.views)
+    assert found.contradicted[last].all() and not found.contradicted[~last].any()
+
+
 @pytest.mark.slow
 def test_what_close_ups_show_and_do_not_confirm_beside_the_object_goes_though_the_flight_confirms_it(near):
     flight = pack(photographs(8, 9.0, radius=6.0))
