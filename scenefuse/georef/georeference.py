@@ -10,8 +10,9 @@ import numpy as np
 import pycolmap
 
 from scenefuse.cloud.crs import check_in_area, grid_name, projected_crs
+from scenefuse.cloud.import_cloud import near_origin
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, value, write_json
-from scenefuse.core.transforms import Array, box_corners, fit_sim3
+from scenefuse.core.transforms import Array, Sim3, box_corners, fit_sim3
 from scenefuse.georef.control import Control, read_control_points
 from scenefuse.georef.on_cloud import lay_on_cloud
 from scenefuse.georef.placement import (
@@ -105,6 +106,10 @@ def georegister(
         known = read_lengths(lengths, model, sizes)
         found = replace(found, placement=scaled(found.placement, known.scale, len(known.names)))
     transform = found.placement.local_from_model
+    if found.placement.status in ("upright", "scaled"):
+        # Cameras in the coordinates of a map, which nothing names, are too far from zero for meshes in float32.
+        transform = Sim3(1.0, np.eye(3), -near_origin(transform.apply(centres))) @ transform
+        found = replace(found, placement=replace(found.placement, local_from_model=transform))
     model.transform(pycolmap.Sim3d(transform.scale, pycolmap.Rotation3d(transform.rotation), transform.translation))
     adjustment: dict[str, Any] = {}
     if not held:

@@ -350,3 +350,17 @@ def test_stage_without_gps_names_no_metre(model):
     assert value(report, "length_unit") == "scene units"
     assert value(report, "scale") == 1.0
     assert moved.num_reg_images() == 8
+
+
+def test_cameras_in_the_coordinates_of_a_map_that_nothing_names_come_near_zero(model):
+    folder, names, truth = model
+    far, at = pycolmap.Reconstruction(folder / "sparse"), np.array([450_000.0, 5_200_000, 300])
+    far.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(np.eye(3)), at))
+    before = camera_poses(far)[2]
+    far.write(folder / "sparse")
+    report, moved = georegister_in(folder, [Photo(n, 100, 100, "") for n in names])
+    _, _, centres = camera_poses(moved)
+    # Meshes are made, and drawn, in float32.
+    assert np.abs(centres).max() < 20 * np.ptp(centres, axis=0).max()
+    there = Sim3.from_matrix(np.array(value(report, "scene_from_sparse"))).apply(before)
+    np.testing.assert_allclose(centres, there, atol=1e-6)
