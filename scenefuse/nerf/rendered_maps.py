@@ -316,9 +316,10 @@ def measure_quality(
 
 
 def right_half(mask: Tensor) -> Tensor:
-    """The pixels of a mask (H, W) on the right of their median column."""
+    """The pixels of a mask (H, W) on the right of their median column; all where there are none."""
     columns = torch.arange(mask.shape[1]).expand_as(mask)
-    return mask & (columns > columns[mask].median()) if mask.any() else mask
+    right = mask & (columns > columns[mask].median()) if mask.any() else mask
+    return right if right.any() else mask
 
 
 def fitted_to_left_half(rendered: Tensor, photo: Tensor, mask: Tensor) -> Tensor:

@@ -141,6 +141,9 @@ def test_the_fit_on_the_left_half_does_not_see_the_right_half():
     assert right.sum() == (mask & ~right).sum() and not (right & ~mask).any()
     fitted = fitted_to_left_half(render, photo, mask)
     assert torch.allclose(fitted[mask], photo[mask], atol=2e-3)
+    pole = mask & (torch.arange(30) == 9)  # one column, whose quality would be no number
+    assert torch.equal(right_half(pole), pole)
+    assert torch.equal(fitted_to_left_half(render, photo, pole), render)
     changed = photo.clone()
     changed[right] = 0.1
     assert torch.equal(fitted_to_left_half(render, changed, mask), fitted)
