@@ -45,7 +45,7 @@ class RunSettings:
     """Table of scenes."""
     objects: str = setting("config/objects.tsv")
     """Table of objects."""
-    seed: int = setting(0, least=0)
+    seed: int = setting(0, least=0, most=2**31 - 1)
     """Seed of everything random."""
     gpu: int | Literal["auto"] = setting("auto", least=0)
     """GPUs that a stereo or training job asks the scheduler for; `auto` is 1 where Snakemake runs on a machine with an

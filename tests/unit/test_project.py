@@ -67,6 +67,11 @@ def test_the_shown_settings_are_the_shipped_ones():
     assert with_defaults(shown, schema) == with_defaults({}, schema)
 
 
+def test_a_seed_that_colmap_cannot_take_is_refused_before_anything_runs():
+    assert problem({"seed": 20261129}, schema_of("config")) is None
+    assert "seed" in problem({"seed": 20261129184400}, schema_of("config"))
+
+
 @pytest.mark.parametrize("preset", ["draft", "normal", "high"])
 def test_a_preset_holds_settings_and_goes_into_a_new_project(preset, tmp_path):
     found = read_differences(ROOT / f"config/presets/{preset}.yaml")
