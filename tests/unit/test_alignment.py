@@ -186,6 +186,7 @@ def test_the_same_input_gives_the_same_output_and_is_not_written_to(pair, found,
     assert [database.stat().st_mtime for database in databases] == [1e9, 1e9]
 
 
+@pytest.mark.slow
 def test_another_place_is_not_found(pair, tmp_path):
     elsewhere = capture(tmp_path, "elsewhere", world(7), ring(6, 14, 12), 8)
     found = aligned(tmp_path, pair[0], elsewhere)
@@ -308,6 +309,7 @@ def with_twin(tmp_path):
     return obj, scene
 
 
+@pytest.mark.slow
 def test_points_along_one_line_leave_the_rotation_open(tmp_path):
     whole = world(1, 300)
     line = World(whole.points.copy(), whole.looks)
@@ -320,6 +322,7 @@ def test_points_along_one_line_leave_the_rotation_open(tmp_path):
     assert value(found, "found") is False and "rotation open" in value(found, "reason")
 
 
+@pytest.mark.slow
 def test_photos_in_both_models(tmp_path):
     """The scene made from every second photo of the object: the same files, the same features."""
     whole = near(world(1))

@@ -54,6 +54,7 @@ def places(found):
     return np.stack([found.x, found.y, found.z], axis=1)
 
 
+@pytest.mark.slow
 def test_every_point_is_there_once_with_all_it_had(tmp_path, small_nodes):
     cloud = ground()
     las = laspy.read(written(tmp_path, cloud))
@@ -70,6 +71,7 @@ def test_every_point_is_there_once_with_all_it_had(tmp_path, small_nodes):
     assert las.header.number_of_points_by_return[0] == len(cloud)
 
 
+@pytest.mark.slow
 def test_a_box_is_read_whole_without_the_rest(tmp_path, small_nodes):
     cloud = ground()
     low, high = UTM + [-30, 20, -3], UTM + [-20, 30, 3]
@@ -175,6 +177,7 @@ def test_memory_is_bounded_where_tiles_are_heaps_with_strays(tmp_path, small_nod
     assert peaks[0] < peaks[1] / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["stray", "clusters", "equal", "line"])
 def test_a_reader_of_the_octree_finds_every_point_through_empty_cubes(tmp_path, small_nodes, case):
     points = np.random.default_rng(0).random((8000, 3)) * [50, 50, 5]
@@ -192,6 +195,7 @@ def test_a_reader_of_the_octree_finds_every_point_through_empty_cubes(tmp_path, 
     assert np.allclose(np.sort(found, axis=0), np.sort(turned(points), axis=0), atol=6e-4)
 
 
+@pytest.mark.slow
 def test_the_same_cloud_gives_the_same_file(tmp_path, small_nodes):
     one, other = (written(tmp_path, ground()).read_bytes() for _ in range(2))
     assert one == other

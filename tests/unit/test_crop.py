@@ -52,6 +52,7 @@ def test_the_papers_crop_is_all_that_lies_in_the_least_box_of_the_fiducials():
     assert (crop_cloud(trial.scene, marks, Z, replace(settings, minimal=False)).keep != inside).any()
 
 
+@pytest.mark.slow
 def test_without_ground_nothing_is_removed_and_that_is_said():
     trial = plant("sculpture", 1, ground=False, noise=0.002, object_points=4000, density_ratio=1.0)
     cut = crop_cloud(trial.scene, trial.fiducials, Z, SETTINGS)
@@ -213,6 +214,7 @@ def test_what_shines_through_a_hole_far_behind_the_object_is_not_the_object(orbi
     assert not votes.object[:50].any()
 
 
+@pytest.mark.slow
 def test_what_hides_the_object_takes_no_vote_from_it(orbit):
     """A fence between some of the cameras and the house; their masks show no house."""
     folder, trial = orbit
@@ -236,6 +238,7 @@ def test_what_hides_the_object_takes_no_vote_from_it(orbit):
     assert shares[0] > 0.8 and shares[1] < 0.4
 
 
+@pytest.mark.slow
 def test_stage_crops_by_masks_as_by_clicks(orbit, tmp_path):
     folder, trial = orbit
     files = stage_files(tmp_path, trial, trial.fiducials)
@@ -266,6 +269,7 @@ def test_without_fiducials_and_without_an_alignment_the_sentence_names_both_ways
     assert not files["crop"].exists()
 
 
+@pytest.mark.slow
 def test_masks_come_before_fiducials_which_then_check_them(orbit, tmp_path):
     folder, trial = orbit
     files = stage_files(tmp_path, trial, trial.fiducials)

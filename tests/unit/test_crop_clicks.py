@@ -75,6 +75,7 @@ def inside(*points):
     return [("inside", point) for point in points]
 
 
+@pytest.mark.slow
 def test_five_clicks_in_one_photo_cut_out_all_sides_of_the_object(crop):
     kept, report = crop(inside(*CORNERS))
     # The walls away from the camera too; points in the ground's thickness go with the ground.

@@ -208,6 +208,7 @@ def pole():
     return Scene(np.concatenate([own, bar]), patch((-4, 4), (-4, 4), 0.0, 500000), marks)
 
 
+@pytest.mark.slow
 def test_ground_that_would_be_nearly_everything_is_left_in_and_that_is_recorded_and_printed(tmp_path, capsys):
     scene = pole()
     write_cloud(tmp_path / "dense.ply", scene.cloud)

@@ -97,6 +97,7 @@ def maps(workspace, tmp_path_factory):
 
 
 # Those of the object's and of the scene's stereo; the kernel is compiled for each, which takes ten seconds.
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [5, pytest.param(7, marks=pytest.mark.slow)])
 def test_matching_kernel_scores_as_its_twin(window):
     rng = np.random.default_rng(0)

@@ -97,6 +97,7 @@ def test_settings_exist(page):
     assert missing_keys(page.read_text()) == []
 
 
+@pytest.mark.slow
 @names(PAGES)
 def test_numbers_are_those_of_the_constants(page):
     text = page.read_text()
@@ -196,6 +197,7 @@ def test_what_is_gone_is_noticed(tmp_path):
     assert missing_keys(text) == ["object.masks.gone", "object: { gone: 1 }"]
 
 
+@pytest.mark.slow
 def test_the_ten_settings_are_shipped_as_their_table_says():
     text = (ROOT / "config/README.md").read_text().split("## How to write")[0]
     rows = re.findall(r"^\| `([a-z0-9_.]+)` \| (\S+) \|", text, flags=re.M)

@@ -173,6 +173,7 @@ def test_what_no_photo_confirms_is_told_apart_and_added_only_on_demand(near, far
     assert check(obj, scene, near, far, nerf_only=True).added[last].mean() > 0.8
 
 
+@pytest.mark.slow
 def test_an_object_that_is_a_little_off_is_laid_on_the_scene(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04)
     off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.04]))
@@ -205,6 +206,7 @@ def test_a_sheet_that_does_not_say_how_large_it_is_keeps_its_scale():
     assert pose.scale == pytest.approx(1.0, abs=1e-9) and moved < 0.01
 
 
+@pytest.mark.slow
 def test_spread_of_a_pose_grows_with_noise():
     def spread(noise):
         eggs = []
@@ -226,6 +228,7 @@ def test_hardly_any_point_of_the_scene_is_no_error(near, far, count):
     assert len(fuse_by_evidence(obj, scene, near, far, FusionSettings())[0].added) > 500
 
 
+@pytest.mark.slow
 def test_one_wrong_camera_changes_little(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.06)
     views = photographs(8, 3.0)
@@ -254,6 +257,7 @@ def test_what_moved_between_flight_and_close_ups_takes_nothing_from_the_scene_an
     assert any("stays where the registration put it" in note for note in notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("without", ["object", "scene", "both"])
 def test_a_side_without_photos_is_judged_by_the_other(near, far, without):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.2, 0.06)
@@ -336,6 +340,7 @@ def test_in_a_hole_of_a_denser_scene_the_objects_points_are_added(near, far):
     assert found.added[inside].mean() > 0.7 and found.added[beside & (np.abs(obj.points[:, 0]) > 0.2)].mean() < 0.05
 
 
+@pytest.mark.slow
 def test_doubles_do_not_make_a_scene_dense(near):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.06)
     found = check(obj, concatenate([scene] * 10), near, near, nerf_only=False)

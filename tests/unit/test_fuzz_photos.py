@@ -94,6 +94,7 @@ VALUES |= st.text(max_size=12) | st.sampled_from(ODD) | st.from_regex(r"-?\d{1,3
 XMP = '<x drone-dji:GpsLatitude="{}" drone-dji:GpsLongtitude="{}" drone-dji:RtkStdLon="{}" exif:GPSAltitude="{}"/>'
 
 
+@pytest.mark.slow
 @given(st.dictionaries(st.integers(1, 6), VALUES), st.lists(st.sampled_from(ODD) | NUMBERS.map(str), min_size=4))
 def test_positions_of_exif_and_xmp(gps, words):
     position, note = within_limits(stated_position, gps, XMP.format(*words).encode("utf-8", "surrogatepass"))

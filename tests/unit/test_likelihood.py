@@ -44,6 +44,7 @@ def settled(gate, width=0.5):
     return found
 
 
+@pytest.mark.slow
 def test_a_thin_object_under_thick_noise_is_laid_right_and_states_how_certain_it_is(gate):
     trial = gate[0]
     pose, uncertainty = settled(gate)
@@ -54,6 +55,7 @@ def test_a_thin_object_under_thick_noise_is_laid_right_and_states_how_certain_it
     assert uncertainty.scale_sd_log < 0.01
 
 
+@pytest.mark.slow
 def test_less_noise_is_more_certain(gate):
     diagonal, rough, fine = gate[0].diagonal, settled(gate)[1], settled(planted(noise=0.003))[1]
     assert fine.size(diagonal) < 0.7 * rough.size(diagonal)
@@ -84,6 +86,7 @@ def test_a_scale_of_no_width_is_held_and_certain(gate):
     assert uncertainty.scale_sd_log == pytest.approx(0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_two_runs_agree_bit_for_bit(gate):
     first, second = settled(gate), settled(gate)
     assert np.array_equal(first[0].matrix, second[0].matrix)

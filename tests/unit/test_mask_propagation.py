@@ -436,6 +436,7 @@ def of_points(photos):
     return target_from_votes(kind, photos, np.array([0, 0, 1.0]), 0)
 
 
+@pytest.mark.slow
 def test_clicks_count_in_their_own_photo_to_the_end_with_grabcut(photos):
     told = {2: clicks([], [], [[30, 15], [90, 45]])}
     plain, corrected = (segment_by_grabcut(of_points(photos), photos, COARSE, clicked) for clicked in ({}, told))

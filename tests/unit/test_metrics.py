@@ -71,6 +71,7 @@ def test_an_object_that_is_too_small_has_a_low_fitness_though_all_of_it_lies_on_
     assert found["fitness"]["value"] == pytest.approx(9**2 / 40**2)
 
 
+@pytest.mark.slow
 def test_self_consistency_is_of_both_whole_clouds_at_their_own_density():
     """A ripple whose normals turn by 90 degrees every half unit: a thinned cloud has more of its neighbours there."""
     x, y = np.meshgrid(np.arange(0, 60, 0.05), np.arange(0, 6, 0.05))

@@ -110,6 +110,7 @@ def test_points_that_no_photo_confirms_are_told_apart_by_texture(waves, kind):
     assert (len(stations) > 0 and stations[0].photos[1].centre[2] > CENTER[2]) == (kind == Lack.CONTRADICTED)
 
 
+@pytest.mark.slow
 def test_what_photos_see_through_is_not_missing(half):
     photos, masks, cloud = half
     floating = Cloud(CENTER + [0, RADIUS + 0.4, 0] + 0.2 * (ball(500).points - CENTER), ball(500).normals)

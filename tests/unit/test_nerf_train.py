@@ -227,6 +227,7 @@ def test_quality_measures():
     assert silhouette_iou(torch.tensor([[0.9, 0.9, 0.1]]), torch.tensor([[True, False, True]])) == pytest.approx(1 / 3)
 
 
+@pytest.mark.slow
 def test_plain_pytorch_trains_like_the_kernels(sphere, monkeypatch):
     with_kernels = _train(sphere, steps=6)[3]
     for module in (field, render):

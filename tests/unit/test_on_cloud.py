@@ -86,6 +86,7 @@ def cameras_off(folder, content):
     return np.linalg.norm(centres - truth[[FLIGHT.names.index(name) for name in names]], axis=1)
 
 
+@pytest.mark.slow
 def test_photos_come_to_lie_on_a_scan_that_their_gps_is_metres_off(tmp_path):
     flown(tmp_path)
     points = field()
@@ -133,6 +134,7 @@ def test_heights_keep_the_name_of_their_zero_and_a_table_that_contradicts_the_fi
         laid(tmp_path, tmp_path / "scan.laz", crs="EPSG:32633")
 
 
+@pytest.mark.slow
 def test_a_user_s_points_are_in_the_scan_s_coordinates(tmp_path):
     flown(tmp_path)
     _, dense, _ = laid(tmp_path, written(tmp_path, field()))
@@ -152,6 +154,7 @@ def test_a_user_s_points_are_in_the_scan_s_coordinates(tmp_path):
     np.testing.assert_allclose(value(read_json(tmp_path / "crop.json"), "fiducials"), dense.points[chosen], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_cloud_that_names_no_crs_takes_the_table_s(tmp_path):
     flown(tmp_path)
     write_cloud(tmp_path / "scan.ply", Cloud(field()))
@@ -170,6 +173,7 @@ def test_control_points_place_photos_without_gps_on_a_scan(tmp_path):
     assert np.array_equal(value(content, "laid_on_cloud_by"), np.eye(4)) and value(report, "met_share") > 0.35
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "points, crs, sentence",
     [

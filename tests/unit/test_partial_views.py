@@ -156,6 +156,7 @@ def test_grabcut_is_not_misled_by_the_ends_of_a_wall_that_lie_behind_the_camera(
     assert mask_iou(found[0], along.pixels) > 0.95
 
 
+@pytest.mark.slow
 def test_masks_agree_as_well_where_cameras_are_in_the_coordinates_of_a_map():
     photos, own, up = around_a_statue(12, 0), surface(STATUE), np.array([0, 0, 1.0])
     scores, corners = [], []

@@ -137,6 +137,7 @@ def test_places_are_ranked_by_their_scores_each_with_its_box(monkeypatch, yard):
     assert np.array_equal(places[0][1], [points.min(0), points.max(0)])
 
 
+@pytest.mark.slow
 def test_a_plane_has_two_sides(yard):
     flat = Cloud(np.random.default_rng(0).uniform(0, 5, (3000, 3)) * [1, 1, 0])
     with np.errstate(all="raise"):

@@ -30,6 +30,7 @@ def straight():
     return mapped_trial(TINY)
 
 
+@pytest.mark.slow
 def test_a_trial_without_bending_is_solved_right(straight):
     object_from_world = Sim3(3.0, np.eye(3)[[1, 2, 0]], np.array([4.0, 5, 6]))
     straight.obj.move(object_from_world @ straight.obj.world_from_model())

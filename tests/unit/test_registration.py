@@ -300,6 +300,7 @@ def test_a_scale_at_the_edge_of_its_prior_is_refused(house):
     assert "at the edge" in refine_hypotheses(problem, [(truth, "planted")], settings).decision.reason
 
 
+@pytest.mark.slow
 def test_a_balloon_without_colours_has_a_free_axis_and_is_no_rival_to_itself():
     def egg(seed):
         points = np.random.default_rng(seed).normal(size=(2000, 3))
@@ -353,6 +354,7 @@ def test_clouds_that_fit_as_well_at_the_pose_of_the_photos_are_as_uncertain_as_t
     np.testing.assert_allclose(outcome.uncertainty.deviations, alone.uncertainty.deviations)
 
 
+@pytest.mark.slow
 def test_what_surfaces_have_wrong_alike_is_a_share_of_their_scatter_and_only_of_poses_by_clouds(house, by_clouds):
     truth, sigma = house.scene_from_object, 0.003 * house.scene.diagonal
     obj, scene = surfaces(house, 0.02)
@@ -384,6 +386,7 @@ def test_photos_at_whose_pose_the_clouds_lie_worse_must_be_that_much_less_uncert
         assert (errors(outcome.ranked[0].pose, truth, centre, house.diagonal)[2] > 0.02) == by_photos
 
 
+@pytest.mark.slow
 def test_photos_overrule_geometry_and_clouds_do_not_carry_their_pose_off(house):
     truth, centre = house.scene_from_object, house.object.points.mean(0)
     half_turn, middle = np.diag([-1.0, -1.0, 1.0]), truth.apply(centre)

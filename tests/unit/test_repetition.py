@@ -115,6 +115,7 @@ def test_colours_tell_by_how_many_bays_a_row_is_shifted():
     assert is_true(outcome, obj)
 
 
+@pytest.mark.slow
 def test_photos_tell_by_how_many_bays_a_row_is_shifted():
     obj, scene = between(row(12, 0), 8.5, 23.3), between(row(12, 1), 1, 14.8)
     alignment = Alignment(Sim3.identity(), Uncertainty.even(0.002, 0.1, 0.01))

@@ -214,6 +214,7 @@ def capture(tmp_path_factory):
     return folder, np.array(centres)
 
 
+@pytest.mark.slow
 def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, monkeypatch):
     # Two threads add in another order now and then, on a busy machine; one is the same bit for bit.
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
@@ -283,6 +284,7 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.slow
 def test_features_and_matches_that_a_signal_ended_are_gone_on_with(capture, tmp_path, monkeypatch):
     folder, _ = capture
     # With more, which photo is done first decides its number.
@@ -352,6 +354,7 @@ def test_matches_of_other_features_are_not_gone_on_with(capture, tmp_path, monke
         np.testing.assert_array_equal(opened.read_keypoints(first), moved)
 
 
+@pytest.mark.slow
 def test_matches_under_another_calibration_are_not_gone_on_with(capture, tmp_path, monkeypatch):
     folder, _ = capture
     photos, features, database = folder / "photos.json", tmp_path / "features.db", tmp_path / "matches.db"

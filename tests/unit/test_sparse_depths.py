@@ -78,6 +78,7 @@ def test_what_stands_beside_the_object_has_its_depth(figure):
     assert (np.abs(covered - plinths)[known] < 0.02 * plinths[known]).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_feet_that_some_photos_cannot_see_stay_in_the_hull_and_the_plinth_does_not_join_it(figure):
     views, plinths = figure
     cut = hull_of(views, None)[2]
@@ -109,6 +110,7 @@ def test_points_of_the_feet_may_lie_beside_the_masks_of_photos_that_cannot_see_t
     assert (compare(*given, sparse_depths(views)).off_mask > 5).all()
 
 
+@pytest.mark.slow
 def test_what_hides_the_object_without_points_of_its_own_is_told_by_those_of_the_object(figure):
     """A bush before the lower half of the figure, in six photos; nothing of it is triangulated."""
     views, _ = figure
@@ -146,6 +148,7 @@ def test_too_few_points_beside_the_object_say_nothing(figure):
     assert np.isinf(sparse_depths(alone)).all()
 
 
+@pytest.mark.slow
 def test_what_lies_beyond_a_smaller_photo_is_neither_off_its_mask_nor_empty(figure):
     views, _ = figure
     narrow = (np.arange(WIDTH) >= WIDTH // 2) & (np.arange(len(views.names)) % 3 == 0)[:, None]
@@ -162,6 +165,7 @@ def test_what_lies_beyond_a_smaller_photo_is_neither_off_its_mask_nor_empty(figu
     assert compare(*given).off_mask > 0 == compare(*given, sparse_depths(smaller)).off_mask
 
 
+@pytest.mark.slow
 def test_many_details_of_a_part_do_not_cut_off_the_rest():
     k = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     v, u = np.indices((HEIGHT, WIDTH)) + 0.5

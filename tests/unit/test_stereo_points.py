@@ -71,6 +71,7 @@ def test_stereo_adds_points_where_there_are_none_and_only_on_what_has_texture(pl
     assert np.median(near.min(1)) > 0.02
 
 
+@pytest.mark.slow
 def test_an_object_without_a_feature_is_found_in_its_masks_by_points_of_stereo(plane):
     found = points_in_masks(plane, [disc(view) & ~below(view) for view in plane.views])
     assert len(found) > 50 and found[:, 1].min() > -0.05 and np.abs(found[:, 2]).max() < 0.2

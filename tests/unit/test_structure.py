@@ -65,6 +65,7 @@ def test_the_demo_stands_on_a_few_packages_and_no_package_imports_it():
     assert [str(path) for path in modules() for name in imported(path) if name.split(".")[0] == "demo"] == []
 
 
+@pytest.mark.slow
 def test_the_library_never_sees_snakemake():
     assert [str(path) for path in modules() for name in imported(path) if name.split(".")[0] == "snakemake"] == []
 

@@ -104,6 +104,7 @@ def test_a_narrow_gap_is_bridged_on_the_surface_that_its_rim_goes_on_as(closed):
     assert np.abs(np.linalg.norm(bridged.vertices.points, axis=1) - 1).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_wide_gap_stays_open_and_its_area_is_said():
     surface = make_mesh(with_hole(sphere(0.03), 0.4, ASIDE), [])
     assert away(surface, ASIDE).min() > 0.3

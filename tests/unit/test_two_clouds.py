@@ -332,6 +332,7 @@ def test_the_page_shows_the_decision_the_scene_in_3d_and_the_matrix_and_fetches_
     assert view["points"]["after"] > 0 and view["total"]["after"] > view["total"]["before"]
 
 
+@pytest.mark.slow
 def test_a_refused_pose_leaves_no_completed_scene_and_nothing_of_an_earlier_run(tmp_path, house, monkeypatch):
     registered_at_once(monkeypatch, house.scene_from_object, registered=False)
     out = tmp_path / "out"

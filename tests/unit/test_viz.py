@@ -330,6 +330,7 @@ def test_stations_are_named_by_where_they_stand_if_north_is_known(capture, tmp_p
     ]
 
 
+@pytest.mark.slow
 def test_an_object_that_lacks_nothing_is_drawn(capture, tmp_path):
     kept = {name: (capture / name).read_bytes() for name in ("missing.ply", "missing.json", "next_photos.csv")}
     write_cloud(capture / "missing.ply", Cloud(np.zeros((0, 3)), None, None, {"missing": np.zeros(0, np.uint8)}))
@@ -386,6 +387,7 @@ def test_the_3d_view_of_a_large_scene_shows_one_in_so_many_points_and_all_of_an_
     assert (view.before_points, view.after_points) == (len(scene), len(fused))
 
 
+@pytest.mark.slow
 def test_a_refused_object_without_a_pose_still_gets_its_figures(capture, tmp_path):
     fine = {"status": quantity("unregistered", ""), "reason": quantity("two poses fit equally well", "")}
     draw(capture, fine, tmp_path / "figures")
