@@ -19,7 +19,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
 from scenefuse.cloud.tiled_cloud import WHOLE, write_tiled
 from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, value, write_json
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.consistency import DepthMap, Votes, back_project, neighbours, vote
+from scenefuse.geometry.consistency import DepthMap, Votes, back_project, neighbours, surface_points, vote
 from scenefuse.geometry.depth_test import MAX_PHOTOS
 from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.pictures import read_depth, read_normals, read_rgb
@@ -127,7 +127,7 @@ def _fuse(
     """A cloud of the pixels that enough maps confirm, with `views` and the size of each, `pixel`; that of the finest
     map's pixels on the surface; and how many pixels have a depth.
 
-    Where several maps show a place, the finest one gives its points.
+    Where several maps show a place, the finest one on the whole gives its points, and each that is finer there.
 
     Args:
         workspace: that the maps belong to.
@@ -160,8 +160,13 @@ def _fuse(
     parts, place = [], {name: (pixel[name], name) for name in maps}
     for name in sorted(maps, key=lambda name: place[name]):
         own = surface(name)
-        finer = vote(own, (surface(other) for other in near[name] if place[other] < place[name]), *limits)
-        own = _only(own, finer.agree == 0)
+        points, *pixels = surface_points(own.view.pixels, own.view.intrinsics, own.view.world_from_cam)
+        size = own.view.pixels[*pixels] / own.view.intrinsics[0, 0]
+        for other in (surface(other) for other in near[name] if place[other] < place[name]):
+            # The far part of an oblique photo is coarser than one from above, as fine as its near part may be.
+            fine = np.zeros(own.view.pixels.shape, bool)
+            fine[*pixels] = other.view.project(points)[1] / other.view.intrinsics[0, 0] <= 1.2 * size
+            own = _only(own, vote(_only(own, fine), [other], *limits).agree == 0)
         parts.append(_points(own, vote(own, map(measured, near[name]), *limits)))
     return concatenate(parts), min(pixel.values()), count
 

@@ -12,6 +12,7 @@ import torch
 
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import look_at
 from scenefuse.geometry.matcher import Matcher
 from scenefuse.mvs import dense_cloud
 from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
@@ -191,37 +192,58 @@ def test_a_cloud_of_few_of_the_measured_pixels_is_noted(workspace, maps, tmp_pat
     assert "of the pixels with a depth are in the cloud" in value(report, "notes")[0]
 
 
-def test_a_high_flight_stays_beside_a_low_one(tmp_path):
-    # Over a level ground at z = 0 the photos of one flight have pixels ten times as large as those of the other.
-    lens = np.array([[75.0, 0, 40], [0, 75, 30], [0, 0, 1]])
-    shifts, views, names = [(0, 0), (0.1, 0), (0, 0.1), (-0.1, 0), (0, -0.1)], [], []
+def cloud_of_ground(folder, eyes_and_targets):
+    """The cloud of exact depth maps of the ground z = 0 from some cameras that look at some places."""
+    lens, views = np.array([[75.0, 0, 40], [0, 75, 30], [0, 0, 1]]), []
+    v, u = np.mgrid[:60, :80] + 0.5
     for part in ("images", "sparse", "maps"):
-        (tmp_path / part).mkdir()
-    for height in (2.0, 20.0):
-        for x, y in shifts:
-            pose = np.column_stack([np.eye(3), [-x * height, -y * height, height]])
-            names.append(f"{height:02.0f}{x}{y}.png")
-            views.append(View(names[-1], lens, np.vstack([pose, [0, 0, 0, 1]]), 80, 60))
-            cv2.imwrite(str(tmp_path / "images" / names[-1]), np.full((60, 80, 3), 90, np.uint8))
-            write_depth(tmp_path / "maps/depth_maps" / f"{names[-1]}.bin", np.full((60, 80), height, np.float32))
-            normals = np.tile(np.array([0, 0, -1], np.float32), (60, 80, 1))
-            write_normals(tmp_path / "maps/normal_maps" / f"{names[-1]}.bin", normals)
-    write_model(tmp_path / "sparse", views)
-    photos = {name: {"sources": [other for other in names if other != name]} for name in names}
+        (folder / part).mkdir(parents=True)
+    for k, (eye, target) in enumerate(eyes_and_targets):
+        pose = np.eye(4)
+        pose[:3, :3] = look_at(eye, target, [0, 1, 0.01])
+        pose[:3, 3] = -pose[:3, :3] @ eye
+        views.append(View(f"{k:02d}.png", lens, pose, 80, 60))
+        falls = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(lens).T @ pose[:3, 2]
+        depth = np.where(falls < -0.02, eye[2] / np.maximum(-falls, 0.02), 0).astype(np.float32)
+        cv2.imwrite(str(folder / "images" / views[-1].name), np.full((60, 80, 3), 90, np.uint8))
+        write_depth(folder / "maps/depth_maps" / f"{views[-1].name}.bin", depth)
+        normals = np.tile(pose[:3, 2].astype(np.float32), (60, 80, 1))
+        write_normals(folder / "maps/normal_maps" / f"{views[-1].name}.bin", normals)
+    write_model(folder / "sparse", views)
+    photos = {view.name: {"sources": [other.name for other in views if other is not view]} for view in views}
     said = {key: quantity("", "") for key in ("backend", "device", "reason")}
-    write_json(tmp_path / "maps.json", said | {"photos": photos})
+    write_json(folder / "maps.json", said | {"photos": photos})
     fuse_depth_maps(
-        workspace=tmp_path,
-        depth=[tmp_path / "maps"],
-        depth_json=[tmp_path / "maps.json"],
+        workspace=folder,
+        depth=[folder / "maps"],
+        depth_json=[folder / "maps.json"],
         settings=DenseCloudSettings(),
-        cloud=tmp_path / "dense.ply",
-        report=tmp_path / "dense.json",
+        cloud=folder / "dense.ply",
+        report=folder / "dense.json",
     )
-    cloud = read_cloud(tmp_path / "dense.ply")
+    return read_cloud(folder / "dense.ply")
+
+
+def test_a_high_flight_stays_beside_a_low_one(tmp_path):
+    # The photos of one flight have pixels ten times as large as those of the other.
+    shifts = [(0, 0), (0.1, 0), (0, 0.1), (-0.1, 0), (0, -0.1)]
+    eyes = [np.array([x * height, y * height, height]) for height in (2.0, 20.0) for x, y in shifts]
+    cloud = cloud_of_ground(tmp_path, [(eye, eye * [1, 1, 0]) for eye in eyes])
     assert set(cloud.fields) == {"views"}
     apart = np.abs(cloud.points[:, :2]).max(1)
     assert (apart < 0.5).sum() > 1000 and ((apart > 2) & (apart < 7)).sum() > 1000
+
+
+def test_oblique_photos_take_no_points_from_those_from_above(tmp_path):
+    # Their near parts are finer than these, and their far parts coarser.
+    above = [(np.array([x, y, 4.0]), np.array([x, y, 0])) for x in (-0.6, 0, 0.6) for y in (2.0, 5.0)]
+    oblique = [(np.array([x, -4.0, 1.2]), np.array([x, -1.5, 0])) for x in (-0.2, 0, 0.2)]
+
+    def far_off(cloud):
+        return ((np.abs(cloud.points[:, 0]) < 1) & (cloud.points[:, 1] > 1) & (cloud.points[:, 1] < 5)).sum()
+
+    alone, both = (cloud_of_ground(tmp_path / f"{k}", cameras) for k, cameras in enumerate((above, above + oblique)))
+    assert len(both) > len(alone) and far_off(both) > 0.9 * far_off(alone)
 
 
 def test_a_point_far_from_all_others_is_found_in_clouds_of_any_size(monkeypatch):
