@@ -21,6 +21,7 @@ from scenefuse.core.machine import has_screen
 from scenefuse.core.settings import OWN_SETTINGS, PACKAGE, ROOT, read_differences
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_cells, read_table
+from scenefuse.marks.clicks import check_marks
 from scenefuse.new_project import OBJECTS, SCENES, cell_of, default_name, fill, is_cloud, make_project, project_rows
 from scenefuse.report.facts import closing_lines
 from scenefuse.report.forecast import FORECAST, duration, read_forecast, seconds_left
@@ -126,6 +127,8 @@ def _check_options(files: Mapping[str, Sequence[Path]], objects: int, cores: int
         missing = next((path for path in given if not path.exists()), None)
         if missing is not None:
             raise StageError(f"{missing} does not exist; correct --{column}")
+    for path in files["prompts"]:
+        check_marks(path)
     most = os.cpu_count() or 1
     if cores is not None and not 1 <= cores <= most:
         raise StageError(f"--cores {cores} cannot be had; give 1 to {most}, or leave it out for all")

@@ -11,7 +11,6 @@ from typing import Literal
 import tyro
 
 from scenefuse.cloud.formats import READERS, columns_in_parts
-from scenefuse.cloud.readers.text import TEXTS
 from scenefuse.core.settings import OWN_SETTINGS, PACKAGE, ROOT, schema_of
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.tables import Row, read_table, read_text
@@ -143,9 +142,8 @@ def _source(path: Path, folder: Path, least: int = FIXING_POINTS) -> dict[str, s
         raise StageError(f"{path} is not a folder of photos, a video nor a cloud ({', '.join(READERS)})")
     elif path.stat().st_size == 0:
         raise StageError(f"{path} is empty; export it again")
-    elif suffix in TEXTS:
-        # Notes are text too.
-        next(columns_in_parts(path)())
+    elif is_cloud(path) and next(columns_in_parts(path, degrees=True)(), None) is None:
+        raise StageError(f"{path} holds no points; look at what wrote it")
     return {"cloud" if is_cloud(path) else "photos": cell_of(path, folder)}
 
 

@@ -6,10 +6,12 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.user_project import CLICKS, Project, film
 
 from scenefuse import command_line, complete
+from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.settings import read_differences
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_table
@@ -33,6 +35,7 @@ def two_folders(tmp_path, monkeypatch):
     project.photos("flight")
     project.photos("close")
     (tmp_path / "clicks.tsv").write_text(CLICKS)
+    (tmp_path / "notes.txt").write_text("a;b;c\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(complete, "has_screen", lambda: False)
     return tmp_path
@@ -153,6 +156,7 @@ def test_masks_take_the_place_of_clicks(two_folders, workflow):
             {"prompts": (Path("clicks.tsv"), Path("clicks.tsv"))},
             "--prompts names 2 for 1 objects with photos; give one",
         ),
+        ({"prompts": (Path("notes.txt"),)}, "notes.txt has to begin with the tab-separated header"),
         ({"masks": (Path("nowhere"),)}, "nowhere does not exist; correct --masks"),
         ({"cores": 0}, "--cores 0 cannot be had; give 1 to"),
         ({"cores": 9999}, "--cores 9999 cannot be had; give 1 to"),
@@ -179,12 +183,16 @@ def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
         (two_folders / name).mkdir()
     Path("filmed/clip.MP4").touch()
     Path("notes.txt").write_text("Flight of 12 May\nwindy\n")
+    write_cloud(Path("none.ply"), Cloud(np.zeros((0, 3))))
+    Path("page.ply").write_text("<html>")
     Project(two_folders).photos("one", 1)
     Project(two_folders).photos("flight/shed", 4)
     for folder, sentence in (
         ("empty", "the photo folder empty holds no photos"),
         ("filmed", r"filmed holds no photos; .*\(or give a video itself: filmed/clip.MP4\)"),
         ("notes.txt", r"notes.txt is not a readable TXT cloud \(none of its first lines holds three numbers"),
+        ("none.ply", "none.ply holds no points; look at what wrote it"),
+        ("page.ply", "page.ply is not a readable PLY cloud"),
         ("one", "one holds 1 photo; 5 or more are needed"),
         ("flight", "flight is given as the scene and as an object"),
         ("flight/shed", "flight/shed lies in .*flight, whose photos in folders below count too; move it elsewhere"),
