@@ -14,7 +14,7 @@ from PIL import Image as Picture
 from scenefuse.core.stage import atomic_file
 
 Image = NDArray[np.uint8]
-# A caption and its picture; None leaves the place empty.
+# A caption and its picture; None leaves the place empty, without a caption too.
 Cell = tuple[str, Image | None]
 # Width and height of a picture on a sheet.
 TILE_PX = (400, 300)
@@ -57,6 +57,7 @@ def draw_sheet(
         for axes, (caption, picture) in zip(row, pictures):
             axes.set_title(caption, fontsize="medium", pad=3)
             axes.spines[:].set_color("0.85")
+            axes.set_visible(picture is not None or caption != "")
             if picture is not None:
                 size = (0, picture.shape[1], picture.shape[0], 0)
                 axes.imshow(picture, interpolation="antialiased", extent=size)

@@ -22,7 +22,7 @@ from scenefuse.photos.geodesy import compass
 from scenefuse.photos.pictures import read_depth, read_mask, read_rgb
 from scenefuse.photos.sheets import TILE_PX, Cell, Image, depth_colors, draw_scale, draw_sheet, save_png
 from scenefuse.photos.workspace import read_views
-from scenefuse.report.render import camera_at, luminance, orbit_camera, point_radii, render
+from scenefuse.report.render import brightened, camera_at, luminance, orbit_camera, point_radii, render
 from scenefuse.report.values import WORDS, load, unit_of
 from scenefuse.report.view import REACH, view_of, within, write_view
 from scenefuse.sfm.gravity import estimate_up
@@ -119,7 +119,7 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
     clouds = [
         (cloud, point_radii(cloud.points, source=cloud.fields.get("source"))) for cloud in (join.before, join.after)
     ]
-    azimuth_deg = _most_changed(clouds, join.framed)
+    azimuth_deg = most_changed(clouds, join.framed)
     large = _large(clouds, join.framed, azimuth_deg, (2 * TILE_PX[0], 2 * TILE_PX[1]))
     pictures: dict[str, Image | Figure] = dict(zip(("before", "after"), large))
     pictures["before_after"] = _before_after(inputs.name, join, clouds)
@@ -167,7 +167,9 @@ def draw_lone_object(
     with atomic_directory(figures) as folder:
         save_png(folder / "object.png", sheet)
         box = framed.min(0), framed.max(0)
-        write_view(folder, view_of(cloud, cloud, *box, {0: name}, unit, SIDES_DEG[0]))
+        radii, none = point_radii(cloud.points), np.zeros(0, np.int64)
+        discs = [(cloud[none], radii[none]), (cloud, radii)]
+        write_view(folder, view_of(cloud, cloud, *box, {0: name}, unit, most_changed(discs, framed)))
 
 
 def _before_after(name: str, join: Surroundings, clouds: Discs) -> Figure:
@@ -207,7 +209,8 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     pictures = [(label, render(cloud, camera, sizes, colors)) for label, camera in cameras.items()]
     seen = ", ".join(f"{color}: {WORDS['missing'][kind.name.lower()]}" for kind, (color, _) in LACKS.items())
     shown = f", the best {len(shown_from)} shown" if len(shown_from) < len(join.stations) else ""
-    note = f"{seen}\n{len(join.stations)} stations to photograph it from{shown}; where they are: next_photos.csv"
+    counted = f"{len(join.stations)} station{'' if len(join.stations) == 1 else 's'}"
+    note = f"{seen}\n{counted} to photograph it from{shown}; where: next_photos.csv"
     sheet = draw_sheet(f"{name}: what is still missing", note, [pictures[:2], pictures[2:]])
     axes, target = sheet.axes[0], from_above.project(middle[None])[0][0]
     places = from_above.project(join.stations)[0]
@@ -229,12 +232,22 @@ def _large(clouds: Discs, framed: Array, azimuth_deg: float, size_px: tuple[int,
     return [render(cloud, camera, radii) for cloud, radii in clouds]
 
 
-def _most_changed(clouds: Discs, framed: Array) -> float:
-    """The azimuth, in degrees, from which before and after differ most."""
-    azimuths = np.arange(0.0, 360.0, 45.0).tolist()
-    pairs = (_large(clouds, framed, azimuth, (120, 90)) for azimuth in azimuths)
-    changes = [float(np.abs(np.subtract(*pair, dtype=np.float32)).mean()) for pair in pairs]
+def most_changed(clouds: Discs, framed: Array) -> float:
+    """The azimuth, in degrees, from which the fronts of surfaces differ most before and after."""
+    azimuths, changes = np.arange(0.0, 360.0, 45.0).tolist(), []
+    for azimuth in azimuths:
+        centre = orbit_camera(framed, azimuth, 15.0, TILE_PX).centre
+        fronts = [(cloud[seen], radii[seen]) for cloud, radii in clouds for seen in [_facing(cloud, centre)]]
+        pair = _large(fronts, framed, azimuth, (120, 90))
+        changes.append(float(np.abs(np.subtract(*pair, dtype=np.float32)).mean()))
     return float(azimuths[int(np.argmax(changes))])
+
+
+def _facing(cloud: Cloud, centre: Array) -> NDArray[np.bool_]:
+    """(N,) points that turn their front to a camera, by their normals; all where there are none."""
+    if cloud.normals is None:
+        return np.ones(len(cloud), bool)
+    return np.asarray(np.einsum("ij,ij->i", centre - cloud.points, cloud.normals) > 0)
 
 
 def _rgb(color: str) -> Array:
@@ -330,7 +343,7 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
     reach = REACH * float(np.linalg.norm(high - low))
     scene, box = open_cloud(inputs.scene), (low - reach, high + reach)
     clouds = scene.near(*box)[1], after_fusion(scene, inputs.checked, inputs.fused, *box)
-    before, after = (cloud[within(cloud.points, low, high, REACH)] for cloud in clouds)
+    before, after = brightened(*(cloud[within(cloud.points, low, high, REACH)] for cloud in clouds))
     if not len(before):
         raise StageError(
             f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"

@@ -133,7 +133,9 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
     modes: list[Mode] = []
     other = {"color": UNKNOWN_COLOR, "label": "unknown"}
     if view.cloud.colors is not None:
-        modes.append({"name": "photo", "button": "Photos", "label": "The colours of the photos"})
+        modes.append(
+            {"name": "photo", "button": "Photos", "label": "Colours of the photos, brightened if all are dark"}
+        )
     codes = sorted(set(view.sources) - {REMOVED})
     sources = {code: (SOURCE_COLORS[k % len(SOURCE_COLORS)], view.sources[code]) for k, code in enumerate(codes)}
     sources[REMOVED] = (REMOVED_COLOR, "scene, removed by fusion")

@@ -143,6 +143,18 @@ def luminance(colors: ArrayLike) -> Array:
     return np.asarray(colors) @ np.array([0.299, 0.587, 0.114])
 
 
+def brightened(*clouds: Cloud) -> list[Cloud]:
+    """Clouds with lighter colours where all are dark, as at dusk or in shade.
+
+    One factor makes their median a middle grey, but saturates no more than one point in a hundred.
+    """
+    known = np.concatenate([np.full((1, 3), 255), *(c.colors for c in clouds if c.colors is not None)])
+    median, high = np.median(luminance(known)), np.percentile(known.max(1), 99)
+    factor = max(1.0, min(128 / max(median, 1), 255 / max(high, 1)))
+    colors = [None if c.colors is None else np.minimum(c.colors * factor, 255).astype(np.uint8) for c in clouds]
+    return [replace(cloud, colors=lighter) for cloud, lighter in zip(clouds, colors)]
+
+
 def render(
     cloud: Cloud,
     camera: Camera,

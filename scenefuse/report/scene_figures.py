@@ -21,7 +21,7 @@ from scenefuse.photos.geodesy import length_unit, scene_frame
 from scenefuse.photos.sheets import TILE_PX, Cell, draw_scale, draw_sheet, save_png
 from scenefuse.photos.workspace import View as PhotoView
 from scenefuse.photos.workspace import read_views
-from scenefuse.report.render import MAX_DRAWN, Camera, orbit_camera, point_radii, render
+from scenefuse.report.render import MAX_DRAWN, Camera, brightened, orbit_camera, point_radii, render
 from scenefuse.report.values import read_table
 from scenefuse.report.view import view_of, within, write_view
 
@@ -58,7 +58,7 @@ def draw_scene(
     """
     scene = open_cloud(dense)
     every = max(1, -(-len(scene) // MAX_DRAWN))
-    cloud = concatenate([part for _, part in scene.parts(every)])
+    (cloud,) = brightened(concatenate([part for _, part in scene.parts(every)]))
     views = [] if georeferenced is None else read_views(georeferenced)
     shown = [folder for folder in objects if folder.name not in failed]
     crops = {f.name: read_cloud(f / "registration/full/crop.ply").points for f in shown}
@@ -98,7 +98,7 @@ def _scene_sheet(
         most = len(OVERLAP_COLORS) - 1
         overlap = render(cloud, above, radii, OVERLAP_COLORS[np.minimum(counts, most)])
         errors_below = render(cloud, above, radii, (215, 215, 215))
-        rows.append([("cameras against their GPS", errors_below), ("photos that show a place", overlap)])
+        rows.append([("how many photos show each place", overlap), ("cameras against their GPS", errors_below)])
     sheet = draw_sheet(title, note, rows, size)
     axes: Any
     for axes, camera in zip(sheet.axes, (above, oblique)):
@@ -110,12 +110,12 @@ def _scene_sheet(
     if views:
         for number, color in enumerate(OVERLAP_COLORS):
             label = f"{number}" + (" or more" if number == most else "")
-            sheet.axes[3].plot([], [], "s", color=color / 255, label=label)
-        sheet.axes[3].legend(
+            sheet.axes[2].plot([], [], "s", color=color / 255, label=label)
+        sheet.axes[2].legend(
             loc="upper center", bbox_to_anchor=(0.5, 0.0), borderpad=0.2, frameon=False,
             ncols=most + 1, handletextpad=0, columnspacing=0.4, fontsize="x-small",
         )  # fmt: skip
-        _draw_errors(sheet.axes[2], above, {view.name: view.centre for view in views}, errors)
+        _draw_errors(sheet.axes[3], above, {view.name: view.centre for view in views}, errors)
     for axes in sheet.axes[: 3 if views else 1 : 2]:
         draw_scale(axes, above.focal_px, *place)
     return sheet
@@ -126,7 +126,7 @@ def _draw_errors(axes: Any, camera: Camera, centres: dict[str, Array], errors: p
     errors = errors[errors.kind == "position"].dropna(subset=["east_m", "north_m"]) if len(errors) else errors
     errors = errors[errors.name.isin(centres)] if len(errors) else errors
     if errors.empty:
-        axes.set_title("no positions by GPS to compare with", fontsize="medium", pad=3)
+        axes.set_visible(False)
         return
     pixels = camera.project(np.array([centres[name] for name in errors.name]))[0]
     sides = errors[["east_m", "north_m"]].abs().to_numpy()

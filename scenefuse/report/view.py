@@ -32,7 +32,7 @@ from scenefuse.cloud.clouds import (
 from scenefuse.cloud.tiled_cloud import MORTON_BITS, morton
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array
-from scenefuse.report.render import luminance, point_radii
+from scenefuse.report.render import brightened, luminance, point_radii
 
 Bytes = NDArray[np.uint8]
 
@@ -117,7 +117,7 @@ def view_of(
 ) -> View:
     """Both clouds as one thinned view of the box from `low` to `high`; near is what lies in the boxes `near`, else in
     that one."""
-    points = merge(before, after)
+    points = merge(*brightened(before, after))
     points.fields["near"][:] = np.any([within(points.points, *box) for box in near or [(low, high)]], axis=0)
     counts = len(before), len(after)
     return View(thin(points, VIEW_POINTS), sources, unit, low, high, azimuth_deg, elevation_deg, *counts)

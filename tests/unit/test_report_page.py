@@ -163,7 +163,7 @@ def test_a_scene_of_kilometres_fills_its_view(browser, page):
 def test_every_way_of_colouring_changes_the_picture_and_has_its_legend(opened):
     pictures = {}
     for mode, words in {
-        "Photos": "The colours of the photos",
+        "Photos": "Colours of the photos, brightened if all are dark",
         "Source": "added",
         "Class": "not measured: from the NeRF or a given cloud",
         "Std. deviation": "49.0 mm",

@@ -12,9 +12,9 @@ from scenefuse.core.transforms import Sim3
 from scenefuse.photos.pictures import write_depth
 from scenefuse.photos.sheets import draw_scale, draw_sheet, round_below
 from scenefuse.photos.workspace import read_views
-from scenefuse.report.figures import FigureInputs, draw_lone_object, draw_object
+from scenefuse.report.figures import FigureInputs, draw_lone_object, draw_object, most_changed
 from scenefuse.report.page import view_section
-from scenefuse.report.render import Camera, camera_at, orbit_camera, point_radii, render
+from scenefuse.report.render import Camera, brightened, camera_at, orbit_camera, point_radii, render
 from scenefuse.report.scene_figures import draw_scene, view_scene
 from scenefuse.report.view import Shown, read_view
 
@@ -82,6 +82,30 @@ def test_text_of_a_sheet_of_larger_pictures_is_larger_and_its_pictures_keep_thei
         sheet = draw_sheet("a", "b", [[("c", picture)]], size)
         assert sheet.dpi == size[0] / 4
         assert sheet.axes[0].get_window_extent().size == pytest.approx(size, abs=1)
+
+
+def test_a_place_of_a_sheet_without_picture_and_caption_has_no_frame():
+    sheet = draw_sheet("a", "b", [[("seen", np.zeros((3, 4, 3), np.uint8)), ("lacking", None), ("", None)]])
+    assert [axes.get_visible() for axes in sheet.axes] == [True, True, False]
+
+
+def test_clouds_that_are_dark_together_are_drawn_brighter_by_one_factor():
+    dark, darker = plane(0.0, (40, 20, 30)), plane(1.0, (20, 10, 15))
+    bright = [cloud.colors[0] for cloud in brightened(dark, darker)]
+    assert 120 < bright[0].max() <= 255 and np.abs(bright[0] - 2.0 * bright[1]).max() <= 2
+    # A white wall beside a dark ground sets how far: its colour stays.
+    for light, dim in ((plane(0.0, (250, 250, 250)), darker), (plane(0.0, (150, 150, 150), count=5), dark[[]])):
+        assert brightened(light, dim)[0].colors[0].max() <= 255
+        assert np.abs(brightened(light, dim)[0].colors[0] - light.colors[0].astype(int)).max() <= 5
+
+
+@pytest.mark.parametrize("front", [-1.0, 1.0])
+def test_the_large_picture_shows_the_front_of_what_was_added(front):
+    y, z = (a.ravel() for a in np.meshgrid(*[np.linspace(-1, 1, 60)] * 2))
+    points, normals = np.stack([0 * y, y, z], axis=1), np.tile([front, 0.0, 0.0], (len(y), 1))
+    wall = Cloud(points, normals.astype("f4"), np.full((len(y), 3), 90, np.uint8))
+    before, after = ((cloud, np.full(len(cloud), 0.05)) for cloud in (wall[z > 0.8], wall))
+    assert most_changed([before, after], points) == (0.0 if front > 0 else 180.0)
 
 
 def test_the_nearer_surface_hides_the_farther_one_and_holes_stay_background():
@@ -443,7 +467,7 @@ def test_the_scene_s_sheet_shows_the_errors_of_cameras_in_their_colour(capture, 
             figure=tmp_path / "scene.png",
         )  # fmt: skip
         picture = cv2.imread(str(tmp_path / "scene.png")).astype(int)
-        errors = picture[picture.shape[0] // 2 :, : picture.shape[1] // 2]
+        errors = picture[picture.shape[0] // 2 :, picture.shape[1] // 2 :]
         return ((errors[..., 0] - errors[..., 2]) > 60).sum()
 
     # All cameras too low (blue) but for the first, which sets the range of colours both times; then too high (red).
