@@ -66,8 +66,11 @@ def object_facts(row: Row) -> dict[str, str]:
         absolute = "; on Earth as exact as the scene (see Position)"
         facts["Accuracy"] = found[0] + (absolute if "crs" in has else "")
     if "scale_sd_log" in has:
-        facts["Scale"] = _trust(scale_sd(row), unit) + ("" if has.get("scene_scale_sd_log") else ", beside the scene's")
-        facts["Scale"] += ", not in metres" if unit == "scene units" else ""
+        relative = "" if has.get("scene_scale_sd_log") else ", if the scene's is right"
+        facts["Scale"] = _trust(scale_sd(row), unit) + relative
+        if unit == "scene units":
+            known = f"{percent(scale_sd(row))} (standard deviation)"
+            facts["Scale"] = f"not in metres; beside the scene it is known to {known}"
     if "registered" in has and "frames" in has:
         taken = f"taken {has['photographed']}" if "photographed" in has else "undated"
         facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used, {taken}"
@@ -209,7 +212,7 @@ def scene_facts(row: Row) -> dict[str, str]:
     elif "error" not in has:
         facts["Photographed"] = "given as a cloud"
     counted = unit_name(pyproj.CRS.from_user_input(has["crs"])) if "crs" in has else unit
-    where = crs_name(has["crs"]) if "crs" in has else "in a local frame"
+    where = crs_name(has["crs"]) if "crs" in has else "in a local frame, without a CRS"
     facts["Coordinates"] = f"{_plural(counted)}, {where}"
     if "latitude_deg" in has:
         north, east = has["latitude_deg"], has["longitude_deg"]
@@ -225,7 +228,7 @@ def scene_facts(row: Row) -> dict[str, str]:
     if "length_unit" in has:
         facts["Scale"] = _scale(has)
     if "ground_pixel" in has:
-        facts["Ground pixel"] = f"{length(has['ground_pixel'], unit)}, what a pixel of a photo covers on the ground"
+        facts["Ground pixel"] = f"{length(has['ground_pixel'], unit)} (GSD), what a photo's pixel covers on the ground"
     if "completed_points" in has:
         file = f"results/scenes/{has['scene']}/completed"
         facts["File"] = f"{file}.copc.laz (for QGIS, CloudCompare)" + (

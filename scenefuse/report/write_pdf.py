@@ -41,10 +41,12 @@ def write_pdf(
         page.text_line(f"Scene {row['scene']}", 12)
         page.facts(scene_facts(row))
     page.text_line("Objects", 12)
-    found = [[each.get("Size", "-"), shorten(each.get("Surface", each["Result"]).split(";")[0], 150)] for each in facts]
+    # What is missing is told apart on the object's own page.
+    surfaces = [each.get("Surface", "").split(":")[0] or shorten(each["Result"], 150) for each in facts]
+    found = [[each.get("Size", "-"), surface] for each, surface in zip(facts, surfaces)]
     page.rows([[folder.name, verdict(row), *more] for folder, row, more in zip(objects, rows, found)], (3, 3, 7, 12))
     for folder in scenes:
-        page.pictures([folder / "scene.png"], [f"scene {folder.name}, its cameras and their errors"])
+        page.pictures([folder / "scene.png"], [f"scene {folder.name} and its cameras"])
     for folder, row, each in zip(objects, rows, facts):
         page.start(folder.name, page.made)
         page.facts(each)
@@ -52,8 +54,9 @@ def write_pdf(
         if row["status"] not in ADDED:
             continue
         page.pictures([folder / f"figures/{when}.png" for when in ("before", "after")], ["before", "after"])
-        page.start(folder.name, "what is missing, and the four sides")
-        if (folder / "drawings/drawings.json").is_file():
+        is_drawn = (folder / "drawings/drawings.json").is_file()
+        page.start(folder.name, "what is missing" + (", and the four sides" if is_drawn else ""))
+        if is_drawn:
             page.sides(folder / "drawings")
         page.pictures([folder / "figures/missing.png"], ["what is missing, and from where photos would show it"])
     with atomic_file(report) as temporary:

@@ -557,7 +557,8 @@ def test_an_object_says_when_it_was_photographed_and_how_its_lengths_follow_from
         write_json(scene / "georeference.json", here | more)
         text = (summarise(results) / "summary.txt").read_text()
         assert re.search(
-            r"Scale +Trust it to 0\.3 %, 30\.0 mm on a 10 m wall \(standard deviation\), beside the scene's\n", text
+            r"Scale +Trust it to 0\.3 %, 30\.0 mm on a 10 m wall \(standard deviation\), if the scene's is\s+right\n",
+            text,
         )
     assert re.search(r"Scale +It is that of the given cloud; nothing checks it\n", text)
     assert re.search(r"Made with scenefuse [\d.]+ on 20\d\d-\d\d-\d\d\.\n", text)
@@ -620,12 +621,14 @@ def test_photos_without_a_date_are_called_undated():
 def test_coordinates_have_the_name_and_the_unit_of_their_crs_whatever_the_scene_counts_in(unit):
     feet = "US survey foot, NAD83 / California zone 3 (ftUS) (EPSG:2227)"
     assert scene_facts({"scene": "yard", "length_unit": unit, "crs": "EPSG:2227"})["Coordinates"] == feet
-    assert scene_facts({"scene": "yard", "length_unit": unit})["Coordinates"].endswith(", in a local frame")
+    assert scene_facts({"scene": "yard", "length_unit": unit})["Coordinates"].endswith(
+        ", in a local frame, without a CRS"
+    )
 
 
 def test_lengths_of_an_object_in_a_scene_without_a_scale_are_not_trusted_in_metres():
     row = {"object": "head", "status": "registered", "unit": "scene units", "scale_sd_log": 0.011}
-    assert object_facts(row)["Scale"] == "Trust it to 1.1 % (standard deviation), beside the scene's, not in metres"
+    assert object_facts(row)["Scale"] == "Not in metres; beside the scene it is known to 1.1 % (standard deviation)"
 
 
 def test_a_scene_to_which_nothing_was_added_is_not_called_completed(results):
