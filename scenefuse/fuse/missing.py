@@ -29,8 +29,6 @@ from scenefuse.photos.workspace import View
 # Directions that are tried, spread evenly over a sphere around the object, at these distances, in those of its
 # close-ups.
 DIRECTIONS, DISTANCES = 120, (0.7, 1.0, 1.4)
-# Places along a line of sight that are looked at for what stands in the way, as shares of it.
-STEPS = np.linspace(0, 1, 60)
 # Stations at most, and the share of what is missing that one must add.
 MAX_STATIONS, MIN_GAIN = 6, 0.05
 
@@ -274,7 +272,7 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
     step = max(missing.side, spacing(obstacles.points, quantile=SPARSEST))
     lens = sorted(close_ups, key=lambda view: view.intrinsics[0, 0] / view.width)[len(close_ups) // 2]
     photos = [_photos_from(place, middle, lens) for place in _around(middle, distance)]
-    free = _Free(others.points, middle, reach, clearance)
+    free = Free(others.points, middle, reach, clearance)
     photos = [three for three in photos if free.ways(np.array([photo.centre for photo in three]))]
     # What the middle photo shows is the most that all three do; these are tested only where it decides (Minoux 1978).
     shown = np.array([_shown_in_all(three[1:2], cells, obstacles, step, missing.side) for three in photos])
@@ -316,7 +314,7 @@ def _around(middle: Array, distance: float) -> Array:
     return np.concatenate([middle + factor * distance * directions for factor in sorted(DISTANCES)])
 
 
-class _Free:
+class Free:
     """Where a camera can be: above the ground, and with nothing between it and the object."""
 
     def __init__(self, obstacles: Array, middle: Array, reach: float, clearance: float):
@@ -329,17 +327,26 @@ class _Free:
         if (eyes[:, 2] < self.obstacles[self.below.query(eyes[:, :2])[1], 2] + self.clearance).any():
             return False
         ahead = self.middle - eyes
-        ends = np.maximum(0, 1 - self.reach / np.linalg.norm(ahead, axis=1))
-        steps = STEPS[:, None, None] * ends[:, None]
+        length = np.linalg.norm(ahead, axis=1)
+        steps = self._steps(length) * np.maximum(0, 1 - self.reach / length)[:, None]
         return bool((self.near.query((eyes + steps * ahead).reshape(-1, 3))[0] > self.clearance).all())
 
     def sees(self, eyes: Array, points: Array) -> NDArray[np.bool_]:
         """(N,) whether nothing that does not stand beside the object is between any of (E, 3) places and a point."""
-        if not self.beyond.n:
-            return np.ones(len(points), dtype=bool)
-        places = eyes[:, None] + STEPS[:, None, None, None] * (points - eyes[:, None])
-        apart = self.beyond.query(places.reshape(-1, 3), distance_upper_bound=self.clearance / 2, workers=threads())[0]
-        return np.asarray(np.isinf(apart.reshape(-1, len(points))).all(0))
+        free = np.ones(len(points), dtype=bool)
+        for eye in eyes if self.beyond.n else ():
+            ahead = points - eye
+            places = eye + self._steps(np.linalg.norm(ahead, axis=1)) * ahead
+            apart = self.beyond.query(
+                places.reshape(-1, 3), distance_upper_bound=self.clearance / 2, workers=threads()
+            )[0]
+            free &= np.isinf(apart.reshape(-1, len(points))).all(0)
+        return free
+
+    def _steps(self, lengths: Array) -> Array:
+        """Shares (S, 1, 1) of lines of sight, so near each other, unless these are very long, that what stands in the
+        way, thinned to half of the clearance, is not stepped over."""
+        return np.linspace(0, 1, int(np.ceil(min(lengths.max() / (0.7 * self.clearance), 240))) + 1)[:, None, None]
 
 
 def _photos_from(place: Array, middle: Array, lens: View) -> list[View]:

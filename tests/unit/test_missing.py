@@ -15,7 +15,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3, look_at
 from scenefuse.fuse.find_missing import POSITION, MissingInputs, MissingOutputs, find_missing, photo_rows
-from scenefuse.fuse.missing import Lack, Plan, Station, find_missing_surface, plan_stations
+from scenefuse.fuse.missing import Free, Lack, Plan, Station, find_missing_surface, plan_stations
 from scenefuse.geometry.photo_check import pack
 from scenefuse.photos.geodesy import GridFrame, LocalFrame
 from scenefuse.photos.workspace import View, write_model
@@ -138,6 +138,14 @@ def test_no_station_lies_below_the_ground_or_in_a_wall(half):
     plan = plan_stations(missing, cloud, concatenate([cloud, ground, wall]), photos.views)
     eyes = np.array([view.centre for station in plan.stations for view in station.photos]) - CENTER
     assert len(eyes) and (eyes[:, 2] > -RADIUS).all() and (eyes[:, 1] > -4.0).all()
+
+
+def test_no_line_of_sight_steps_through_a_fence():
+    x, z = (a.ravel() for a in np.meshgrid(np.arange(-1, 1, 0.025), np.arange(-0.5, 1, 0.025)))
+    free = Free(np.stack([x, np.full_like(x, -2.0), z], 1), np.zeros(3), 0.6, 0.05)
+    eyes = np.stack([np.full(100, 0.01), -np.linspace(2.2, 8, 100), np.full(100, 0.3)], 1)
+    assert not any(free.ways(eye[None]) or free.sees(eye[None], np.zeros((1, 3))).any() for eye in eyes)
+    assert free.sees(eyes[-1:], eyes[:1]).all()
 
 
 @pytest.mark.slow
