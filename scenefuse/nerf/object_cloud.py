@@ -12,6 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from scenefuse.cloud.cloud_file import NEIGHBOURS
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, write_cloud
 from scenefuse.cloud.import_cloud import MIN_POINTS
 from scenefuse.core.machine import use_threads
@@ -174,6 +175,7 @@ def _confirmed(
     fields = {
         "confidence": maps.confidence[index, rows, columns].astype(np.float32),
         "views": (found.agree[keep] + 1).astype(np.int32),
+        "pixel": maps.depths[index, rows, columns] / intrinsics[index, 0, 0],
     }
     return Cloud(found.mean[keep], normals, views.images[index, rows, columns], fields)
 
@@ -185,10 +187,18 @@ def footprint(depths: Maps, intrinsics: NDArray[np.float64]) -> float:
 
 
 def clean(cloud: Cloud, min_component: float, step: float) -> Cloud:
-    """Drop points far from all others, then small groups that no chain of steps of 3 x `step` joins to the rest."""
-    cloud = cloud[near_others(cloud.points)]
-    pairs = cKDTree(cloud.points).query_pairs(MAX_STEP * step, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cloud), len(cloud)))
+    """Drop points far from all others, then small groups that no chain of steps of 3 x `step` joins to the rest; where
+    the field `pixel`, which goes, is larger than the step, points lie so far apart."""
+    size = np.maximum(cloud.fields.get("pixel", np.zeros(len(cloud))), step)
+    near = near_others(cloud.points, size)
+    cloud, size = cloud[near], size[near]
+    cloud.fields.pop("pixel", None)
+    tree, coarse = cKDTree(cloud.points), np.flatnonzero(size > step)
+    pairs = tree.query_pairs(MAX_STEP * step, output_type="ndarray")
+    distance, other = tree.query(cloud.points[coarse], k=min(NEIGHBOURS + 1, len(cloud)), workers=threads())
+    row, column = np.nonzero(distance <= MAX_STEP * size[coarse, None])
+    together = np.concatenate([pairs, np.column_stack([coarse[row], other[row, column]])])
+    graph = coo_matrix((np.ones(len(together)), together.T), shape=(len(cloud), len(cloud)))
     group = connected_components(graph, directed=False)[1]
     return cloud[np.bincount(group)[group] >= min_component * len(cloud)]
 

@@ -86,6 +86,15 @@ def test_cleaning_drops_a_small_group_and_far_points():
     assert len(cleaned) == len(grid) and cleaned.points[:, 2].max() == 0 and cleaned.points[:, 0].max() < 20
 
 
+def test_what_close_ups_do_not_show_stays_beside_what_they_do():
+    """A statue's body, with pixels ten times as large as those of its head."""
+    grid = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0), [0.0]), -1).reshape(-1, 3)
+    body, stray = 10 * grid[:800] + [45.0, 0, 0], np.array([[100.0, 100, 90]])
+    points, pixel = np.concatenate([grid, body, stray]), np.repeat([1.0, 10.0, 10.0], [len(grid), len(body), 1])
+    cleaned = clean(Cloud(points, fields={"pixel": pixel}), 0.02, 1.0)
+    assert len(cleaned) == len(points) - 1 and cleaned.points[:, 2].max() == 0 and not cleaned.fields
+
+
 def test_a_missing_model_is_named(tmp_path):
     with pytest.raises(StageError, match="model.pt does not exist; run the NeRF stage first"):
         make_object_cloud(
