@@ -174,7 +174,7 @@ class Votes:
     Attributes:
         agree: number of maps that hold the same surface there.
         through: number of maps that measured a surface behind it: it floats in front of theirs.
-        mean: (H, W, 7) mean depth, normal and colour of it and of those that agree.
+        mean: (H, W, 7) mean depth, normal and colour of it and of those that agree; finer ones count more.
     """
 
     agree: NDArray[np.uint16]
@@ -215,14 +215,15 @@ def vote(
     """
     depth = own.view.pixels
     agree, through = np.zeros(depth.shape, np.uint16), np.zeros(depth.shape, np.uint16)
-    total = np.concatenate([depth[..., None], own.normals, own.colors], axis=2, dtype=np.float32)
+    once = np.ones((*depth.shape, 1))
+    total = np.concatenate([depth[..., None], own.normals, own.colors, once], axis=2, dtype=np.float32)
     limit = max_depth_error, float(max_reprojection_px), math.cos(math.radians(max_normal_error_deg))
     for other in others:
         between = _between(own.view, other.view), _between(other.view, own.view)
-        _count(
-            depth, own.normals, other.view.pixels, other.normals, other.colors, *between, *limit, agree, through, total
-        )
-    return Votes(agree, through, total / (agree + np.float32(1))[..., None])
+        longer = other.view.intrinsics[0, 0] / own.view.intrinsics[0, 0]
+        of_other = other.view.pixels, other.normals, other.colors
+        _count(depth, own.normals, *of_other, *between, longer, limit, agree, through, total)
+    return Votes(agree, through, total[..., :7] / total[..., 7:])
 
 
 def _between(a: View, b: View) -> Array:
@@ -234,14 +235,16 @@ def _between(a: View, b: View) -> Array:
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _count(  # type: ignore[no-untyped-def]
-    depth, normals, other, other_normals, colors, there, back, max_error, max_px, min_cosine, agree, through, total
+    depth, normals, other, other_normals, colors, there, back, longer, limits, agree, through, total
 ):
-    """Add one map's votes to agree and through (H, W) uint16, and what it holds where it agrees to total (H, W, 7).
+    """Add one map's votes to agree and through (H, W) uint16, and what it holds where it agrees, and its weight, to
+    total (H, W, 8): errors of depth are as large as pixels.
 
     depth (H, W) and other (h, w) float32, 0 for none; normals and colors of them likewise (..., 3); there and back
-    (3, 4) as `_between` makes them.
+    (3, 4) as `_between` makes them; longer: the other's focal length over the map's; limits: those of `vote`, of
+    normals as a cosine.
     """
-    height, width = depth.shape
+    (height, width), (max_error, max_px, min_cosine) = depth.shape, limits
     for row in prange(height):
         held = np.zeros(7, np.float32)
         for column in range(width):
@@ -286,8 +289,10 @@ def _count(  # type: ignore[no-untyped-def]
                     held[4 + c] += share * colors[j, i, c]
             if weight > 0:
                 agree[row, column] += np.uint16(1)
+                finer = (longer * d / z) ** 2
                 for c in range(7):
-                    total[row, column, c] += held[c] / weight
+                    total[row, column, c] += finer * held[c] / weight
+                total[row, column, 7] += finer
             elif behind:
                 through[row, column] += np.uint16(1)
 

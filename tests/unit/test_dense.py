@@ -192,9 +192,9 @@ def test_a_cloud_of_few_of_the_measured_pixels_is_noted(workspace, maps, tmp_pat
     assert "of the pixels with a depth are in the cloud" in value(report, "notes")[0]
 
 
-def cloud_of_ground(folder, eyes_and_targets):
-    """The cloud of exact depth maps of the ground z = 0 from some cameras that look at some places."""
-    lens, views = np.array([[75.0, 0, 40], [0, 75, 30], [0, 0, 1]]), []
+def cloud_of_ground(folder, eyes_and_targets, noise=0.0):
+    """The cloud of depth maps of the ground z = 0, off by a share, from some cameras that look at some places."""
+    rng, lens, views = np.random.default_rng(0), np.array([[75.0, 0, 40], [0, 75, 30], [0, 0, 1]]), []
     v, u = np.mgrid[:60, :80] + 0.5
     for part in ("images", "sparse", "maps"):
         (folder / part).mkdir(parents=True)
@@ -204,7 +204,8 @@ def cloud_of_ground(folder, eyes_and_targets):
         pose[:3, 3] = -pose[:3, :3] @ eye
         views.append(View(f"{k:02d}.png", lens, pose, 80, 60))
         falls = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(lens).T @ pose[:3, 2]
-        depth = np.where(falls < -0.02, eye[2] / np.maximum(-falls, 0.02), 0).astype(np.float32)
+        depth = np.where(falls < -0.02, eye[2] / np.maximum(-falls, 0.02), 0)
+        depth = (depth * (1 + noise * rng.normal(size=depth.shape))).astype(np.float32)
         cv2.imwrite(str(folder / "images" / views[-1].name), np.full((60, 80, 3), 90, np.uint8))
         write_depth(folder / "maps/depth_maps" / f"{views[-1].name}.bin", depth)
         normals = np.tile(pose[:3, 2].astype(np.float32), (60, 80, 1))
@@ -232,6 +233,17 @@ def test_a_high_flight_stays_beside_a_low_one(tmp_path):
     assert set(cloud.fields) == {"views"}
     apart = np.abs(cloud.points[:, :2]).max(1)
     assert (apart < 0.5).sum() > 1000 and ((apart > 2) & (apart < 7)).sum() > 1000
+
+
+def test_a_high_flight_makes_the_points_of_a_low_one_no_less_exact(tmp_path):
+    def error(heights):
+        shifts = [(0, 0), (0.1, 0), (0, 0.1), (-0.1, 0), (0, -0.1)]
+        eyes = [np.array([x * height, y * height, height]) for height in heights for x, y in shifts]
+        folder = tmp_path / f"{len(heights)}"
+        cloud = cloud_of_ground(folder, [(eye, eye * [1, 1, 0]) for eye in eyes], noise=0.002)
+        return np.sqrt((cloud.points[np.abs(cloud.points[:, :2]).max(1) < 0.5, 2] ** 2).mean())
+
+    assert error((2.0, 20.0)) < 1.5 * error((2.0,))
 
 
 def test_oblique_photos_take_no_points_from_those_from_above(tmp_path):
