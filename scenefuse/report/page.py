@@ -133,9 +133,7 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
     modes: list[Mode] = []
     other = {"color": UNKNOWN_COLOR, "label": "unknown"}
     if view.cloud.colors is not None:
-        modes.append(
-            {"name": "photo", "button": "Photos", "label": "Colours of the photos, brightened if all are dark"}
-        )
+        modes.append({"name": "photo", "button": "Natural", "label": "Natural colours, brightened if all are dark"})
     codes = sorted(set(view.sources) - {REMOVED})
     sources = {code: (SOURCE_COLORS[k % len(SOURCE_COLORS)], view.sources[code]) for k, code in enumerate(codes)}
     sources[REMOVED] = (REMOVED_COLOR, "scene, removed by fusion")
@@ -164,7 +162,7 @@ def _mesh_modes(mesh: ViewMesh, deviation: list[Mode]) -> list[Mode]:
     if mesh.uv is not None or mesh.vertices.colors is not None:
         bridged = [entry for entry in found if entry["code"] == FaceClass.BRIDGED]
         label = "The photos on the mesh" if mesh.uv is not None else "The points' colours on the mesh"
-        modes.append({"name": "photo", "button": "Photos", "label": label, "entries": bridged, "other": other})
+        modes.append({"name": "photo", "button": "Natural", "label": label, "entries": bridged, "other": other})
     modes.append({"name": "evidence", "button": "Class", "entries": found, "other": other})
     return modes + deviation
 

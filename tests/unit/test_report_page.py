@@ -163,7 +163,7 @@ def test_a_scene_of_kilometres_fills_its_view(browser, page):
 def test_every_way_of_colouring_changes_the_picture_and_has_its_legend(opened):
     pictures = {}
     for mode, words in {
-        "Photos": "Colours of the photos, brightened if all are dark",
+        "Natural": "Natural colours, brightened if all are dark",
         "Source": "added",
         "Class": "not measured: from the NeRF or a given cloud",
         "Std. deviation": "49.0 mm",
@@ -235,7 +235,7 @@ def test_the_surface_is_shown_with_photos_class_and_deviation_beside_the_points(
 
 def test_colours_whose_fields_are_absent_are_not_offered(opened):
     labels = opened.find("[aria-label='3D view of shed'] .colour").text
-    assert "Photos" in labels and "Source" in labels
+    assert "Natural" in labels and "Source" in labels
     assert "Class" not in labels and "deviation" not in labels
 
 
