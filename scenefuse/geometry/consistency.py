@@ -25,7 +25,7 @@ class DepthAgreement:
         agree: (N,) views whose depth at the point is the point's own, within the tolerance.
         through: (N,) views that see past the point: it floats in front of their surface.
         off_mask: (N,) views in whose picture the point lies off the mask, with nothing before it.
-        mean: (N, 3) mean of the point and the points that agree with it.
+        mean: (N, 3) mean of the point and the points that agree with it; finer ones count more.
         compared: number of other views.
     """
 
@@ -106,18 +106,22 @@ def compare(
         covered: (V, H, W) depth along z from which on a view sees nothing off its mask, where it is known.
     """
     compared = others(view, frame_from_cam)
-    counts, total = np.zeros((3, len(points)), np.int32), points.astype(np.float64)
+    counts, points = np.zeros((3, len(points)), np.int32), points.astype(np.float64)
+    # Errors of depth are as large as pixels.
+    away = (points - frame_from_cam[view, :3, 3]) @ frame_from_cam[view, :3, 2]
+    weight = (intrinsics[view, 0, 0] / away) ** 2
+    total = np.column_stack([points * weight[:, None], weight])
     known = np.zeros((0, 0, 0), np.float32) if covered is None else covered
     # The kernel is compiled again for each layout of arrays.
     cameras = intrinsics.astype(np.float64), frame_from_cam.astype(np.float64, order="C")
-    _compare(points.astype(np.float64), compared, depths, masks, known, *cameras, tolerance, counts, total)
+    _compare(points, compared, depths, masks, known, *cameras, tolerance, counts, total)
     agree, through, off_mask = counts
-    return DepthAgreement(agree, through, off_mask, total / (agree + 1)[:, None], len(compared))
+    return DepthAgreement(agree, through, off_mask, total[:, :3] / total[:, 3:], len(compared))
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _compare(points, compared, depths, masks, covered, intrinsics, frame_from_cam, tolerance, counts, total):  # type: ignore[no-untyped-def]
-    """Add to counts (3, N) of `DepthAgreement` and to the sum (N, 3) of the points that agree.
+    """Add to counts (3, N) of `DepthAgreement`, and to total (N, 4) the points that agree by their weight, and this.
 
     A thread takes neighbouring points through one map after the other: what they look up stays in its cache.
     """
@@ -147,9 +151,11 @@ def _compare(points, compared, depths, masks, covered, intrinsics, frame_from_ca
                 elif z <= measured + tolerance:
                     counts[0, n] += 1
                     # The other view's depth, taken along the ray through the point itself, not the pixel's centre.
+                    weight = (k[0, 0] / measured) ** 2
                     for axis in range(3):
                         along = x * pose[axis, 0] + y * pose[axis, 1] + z * pose[axis, 2]
-                        total[n, axis] += along * measured / z + pose[axis, 3]
+                        total[n, axis] += weight * (along * measured / z + pose[axis, 3])
+                    total[n, 3] += weight
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from support.painted_sphere import CENTER, RADIUS, sphere_views
+from support.textured_plane import plane_views
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import StageError
@@ -93,6 +94,18 @@ def test_what_close_ups_do_not_show_stays_beside_what_they_do():
     points, pixel = np.concatenate([grid, body, stray]), np.repeat([1.0, 10.0, 10.0], [len(grid), len(body), 1])
     cleaned = clean(Cloud(points, fields={"pixel": pixel}), 0.02, 1.0)
     assert len(cleaned) == len(points) - 1 and cleaned.points[:, 2].max() == 0 and not cleaned.fields
+
+
+def test_photos_from_afar_make_the_points_of_close_ups_no_less_exact():
+    def error(distances):
+        views, depths = plane_views(12, 160, 120, distances=distances)
+        depths = (depths * (1 + 0.002 * np.random.default_rng(0).normal(size=depths.shape))).astype(np.float32)
+        maps = SurfaceMaps(depths, np.ones_like(depths), np.zeros((*depths.shape, 3), np.float16))
+        points = fuse_depths(views, maps, CloudSettings())[0].points
+        x, y, z = points[(np.abs(points[:, :2]) < 0.05).all(1)].T
+        return np.sqrt(((z - 3 - 0.3 * x) ** 2).mean())
+
+    assert error((3.0, 0.3)) < 2 * error((0.3,))
 
 
 def test_a_missing_model_is_named(tmp_path):
