@@ -87,7 +87,10 @@ def _added(named: list[str] | None, project: Project) -> list[str]:
     folders = {name: Path("results/objects", name) for name in named or project.objects}
     missing = [name for name, folder in folders.items() if not (folder / "fused.ply").is_file()]
     if missing and (named or len(missing) == len(folders)):
-        if missing[0] in project.objects and not project.objects[missing[0]].get("scene"):
+        if (row := project.objects.get(missing[0])) is None:
+            known = ", ".join(project.objects)
+            sys.exit(f"error: unknown object '{missing[0]}'; {project.settings['objects']} lists: {known}")
+        if not row.get("scene"):
             sys.exit(f"error: {missing[0]} lies in no scene: its result is {folders[missing[0]]}/object.ply, as it is")
         which = f"{folders[missing[0]]}/fused.ply is not" if named else "no results/objects/NAME/fused.ply is"
         sys.exit(f"error: {which} here ({Path.cwd()}); run the workflow first (scenefuse run)")

@@ -676,6 +676,7 @@ def test_export_makes_no_surface_of_an_object_that_was_not_added(tmp_path: Path,
             ["--object", "shed"],
             "shed was not added to the scene, so there is no surface of it; results/summary/summary",
         ),
+        (["--object", "shad"], "unknown object 'shad'; config/objects.tsv lists: shed"),
         (["--what", "surface"], "there is nothing to export as surface; results/summary/summary.txt says"),
     ):
         monkeypatch.setattr(sys, "argv", ["scenefuse", "export", *words])
