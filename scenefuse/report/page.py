@@ -146,7 +146,8 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
         ramp = [to_hex(color) for color in colormaps["viridis"](np.linspace(0, 1, LEVELS))]
         low, high = (length(end, view.unit) for end in deviations)
         entries = [{"code": k + 1, "color": color} for k, color in enumerate(ramp)]
-        ends: Mode = {"ramp": ramp[::3], "low": low, "high": high}
+        label = "Of a point along its line of sight, without that of the object's place"
+        ends: Mode = {"ramp": ramp[::3], "low": low, "high": high, "label": label}
         modes.append({"name": "deviation", "button": "Std. deviation", "other": other, "entries": entries} | ends)
     return modes
 

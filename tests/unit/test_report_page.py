@@ -166,11 +166,12 @@ def test_every_way_of_colouring_changes_the_picture_and_has_its_legend(opened):
         "Natural": "Natural colours, brightened if all are dark",
         "Source": "added",
         "Class": "not measured: from the NeRF or a given cloud",
-        "Std. deviation": "49.0 mm",
+        "Std. deviation": "along its line of sight, without that of the object's place",
     }.items():
         choose(opened, mode)
         pictures[mode] = opened.picture(STAGE)
         assert words in opened.find(f"{SECTION} .view-legend").text, mode
+    assert "49.0 mm" in opened.find(f"{SECTION} .view-legend").text
     names = list(pictures)
     for k, first in enumerate(names):
         for second in names[k + 1 :]:

@@ -253,6 +253,7 @@ class View {
       item.append(dot, text);
       legend.append(item);
     };
+    if (mode.label) legend.append(mode.label);
     if (mode.ramp) {
       const item = document.createElement("span"), ramp = document.createElement("i");
       ramp.className = "ramp";
@@ -260,10 +261,7 @@ class View {
       item.append(mode.low, ramp, mode.high);
       legend.append(item);
       entry(mode.other.color, mode.other.label);
-    } else {
-      if (mode.label) legend.append(mode.label);
-      mode.entries?.filter((e) => e.when.includes(shown)).forEach((e) => entry(e.color, e.label));
-    }
+    } else mode.entries?.filter((e) => e.when.includes(shown)).forEach((e) => entry(e.color, e.label));
     if (shown === "surface") legend.append("Holes are left open: nothing was measured there");
     const count = document.createElement("span"), [from, to] = this.data.runs[shown];
     const [held, all, what] = shown === "surface" ? [about.surface.faces, about.surface.all_faces, "triangles"]
