@@ -97,19 +97,21 @@ def _depth_range(view: View, points: Array) -> tuple[float, float]:
 
 
 def pair_worth(points: Array, a: Array, b: Array) -> tuple[float, float]:
-    """What matching two photos at a and b (3,) is worth, and the median angle between their rays to shared points.
+    """What matching a photo at a (3,) with a source at b is worth, and the median angle between their rays to shared
+    points.
 
     The sum over the points (N, 3) of a weight that falls off below 8 and above 25 degrees, in the manner of MVSNet's
-    and COLMAP's view selection.
+    and COLMAP's view selection, and where the source is more than twice as far (Goesele et al. 2007): it is as coarse.
     """
     if len(points) == 0:
         return 0.0, 0.0
     u, v = points - a, points - b
-    cosine = (u * v).sum(1) / (np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1))
+    near, far = np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)
+    cosine = (u * v).sum(1) / (near * far)
     angles = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     (low, high), (below, above) = GOOD_ANGLES_DEG, FALLOFF_DEG
     width = np.where(angles < low, below, np.where(angles > high, above, 1.0))
-    weight = np.exp(-0.5 * ((angles - np.clip(angles, low, high)) / width) ** 2)
+    weight = np.exp(-0.5 * ((angles - np.clip(angles, low, high)) / width) ** 2) * np.minimum(1, 2 * near / far)
     return float(weight.sum()), float(np.median(angles))
 
 

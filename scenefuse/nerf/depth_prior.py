@@ -217,7 +217,7 @@ def _choose_sources(views: Views, seen: list[NDArray[np.int64]], count: int) -> 
     centres, worth = views.object_from_cam[:, :3, 3], np.full((len(seen), len(seen)), -2.0)
     for k, j in zip(*np.triu_indices(len(seen), 1)):
         shared = views.sparse[np.intersect1d(seen[k], seen[j], assume_unique=True)]
-        worth[k, j] = worth[j, k] = pair_worth(shared, centres[k], centres[j])[0]
+        worth[k, j], worth[j, k] = (pair_worth(shared, *pair)[0] for pair in (centres[[k, j]], centres[[j, k]]))
     worth[:, views.held_out] = -1.0
     np.fill_diagonal(worth, -2.0)
     available = int((~views.held_out).sum()) - 1

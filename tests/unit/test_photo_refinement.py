@@ -6,7 +6,7 @@ import numpy as np
 from support.textured_plane import plane_views, speckled, wrong_depths
 
 from scenefuse.geometry.consistency import back_project
-from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
+from scenefuse.mvs.photo_refinement import RefinementSettings, choose_sources, refine_by_photos
 
 
 def test_wrong_depths_of_a_textured_plane_come_back():
@@ -71,3 +71,11 @@ def test_a_textured_surface_far_from_where_it_is_is_not_photo_consistent():
     views, far_off = speckled(views, truth), (1.3 * truth).astype(np.float32)
     refined = refine_by_photos(views, far_off, RefinementSettings(match_reach_px=1))
     assert refined.inconsistent[truth > 0].mean() > 0.9
+
+
+def test_close_ups_are_matched_with_each_other_first():
+    """Photos from four times as far show what they show too, and from as good angles, but too coarsely."""
+    views, truth = plane_views(12, distances=(3.0, 3.0, 0.75))
+    near = np.arange(12) % 3 == 2
+    first = choose_sources(views, truth.astype(np.float32))[:, :2]
+    assert near[first[near]].all()
