@@ -61,7 +61,8 @@ def write_page(
         parts.append(f"<p>The pose was refused, so there is no completed scene. {escape(value(content, 'next'))}.</p>")
     else:
         scene_points = inputs["scene_points"] - len(done.removed)
-        parts += [_changes(done, scene_points), view_section("scene", title, view_of_scene(names[0], done, up, unit))]
+        parts.append(_changes(done, scene_points, unit))
+        parts.append(view_section("scene", title, view_of_scene(names[0], done, up, unit)))
     if picture.is_file():
         caption = "From above, from the front and from the side: scene grey, object orange; below in their own colours."
         parts.append(figure(picture, caption))
@@ -151,13 +152,13 @@ def view_of_scene(name: str, done: Completed, up: Array | None, unit: str) -> Vi
     return view_of(before, after, low, high, sources, unit, -60.0)
 
 
-def _changes(done: Completed, scene_points: int) -> str:
+def _changes(done: Completed, scene_points: int, unit: str) -> str:
     """What became of the scene, in a paragraph."""
     removed = len(done.removed)
     text = [
         f"{len(done.added):,} points of the object were added to {scene_points:,} of the scene"
         + (f", {removed:,} of which were taken away" if removed else "; none was taken away")
-        + f"; what lies within {number(done.fill_distance)} of the scene's points counts as the same place",
+        + f"; what lies within {number(done.fill_distance)}{_unit(unit)} of the scene's points counts as one place",
         *done.notes,
     ]
     return f"<p>{escape('; '.join(text))}. <code>source</code> of completed.ply: 0 scene, {done.source} object.</p>"
