@@ -185,12 +185,12 @@ def test_an_empty_project_says_what_is_missing(installed, tmp_path):
 
 def test_names_are_made_of_what_files_are_called_and_said(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    for name in ("Häuschen neu.ply", "site.laz"):
-        Path(name).write_bytes(b"cloud")
-    init(Path("new"), scene=Path("site.laz"), objects=(Path("Häuschen neu.ply"),))
+    for name in ("Häuschen neu.ply", "site.ply"):
+        write_cloud(Path(name), Cloud(np.eye(3)))
+    init(Path("new"), scene=Path("site.ply"), objects=(Path("Häuschen neu.ply"),))
     said = capsys.readouterr().out
     assert "Häuschen neu.ply: an object, called Hauschen_neu (names hold only" in said
-    assert "site.laz: the scene\n" in said
+    assert "site.ply: the scene\n" in said
     for name in ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "small/a.jpg"):
         Path("shots", name).parent.mkdir(parents=True, exist_ok=True)
         Path("shots", name).write_bytes(b"photo")
