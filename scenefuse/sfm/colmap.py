@@ -89,7 +89,7 @@ def cancellable(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
 
     A handler for SIGTERM only runs in the main thread, and only between two Python instructions.
     """
-    token = pycolmap.CancellationToken()
+    token, ended = pycolmap.CancellationToken(), threading.Event()
     outcome: dict[str, Any] = {}
 
     def work() -> None:
@@ -97,16 +97,20 @@ def cancellable(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             outcome["result"] = function(*args, cancellation_token=token, **kwargs)
         except BaseException as error:
             outcome["error"] = error
+        finally:
+            ended.set()
 
     worker = threading.Thread(target=work)
     worker.start()
     try:
-        while worker.is_alive():
-            worker.join(0.2)
+        # Until Python 3.13, a join that a signal's exception leaves takes the thread for ended.
+        while not ended.wait(0.2):
+            pass
     except BaseException:
         token.cancel()
-        worker.join()
         raise
+    finally:
+        worker.join()
     if "error" in outcome:
         raise outcome["error"]
     return outcome["result"]

@@ -1,4 +1,8 @@
+import os
 import shutil
+import signal
+import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -176,6 +180,26 @@ def test_an_error_in_a_worker_reaches_the_caller():
 
     with pytest.raises(ValueError, match="inside"):
         cancellable(fail)
+
+
+def test_a_signal_ends_a_long_function_and_waits_for_it():
+    ended = []
+
+    def work(cancellation_token):
+        time.sleep(0.3)
+        os.kill(os.getpid(), signal.SIGUSR1)
+        while not cancellation_token.is_cancelled:
+            time.sleep(0.01)
+        time.sleep(0.5)
+        ended.append(True)
+
+    before = signal.signal(signal.SIGUSR1, lambda *_: sys.exit(3))
+    try:
+        with pytest.raises(SystemExit):
+            cancellable(work)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert ended
 
 
 @pytest.fixture(scope="module")
