@@ -220,7 +220,8 @@ def _run_workflow(project: Path, targets: list[str], cores: int | None) -> None:
                     report_step(project, line.rstrip(), started, cores)
         except BaseException:
             # Its jobs, too, as a terminal does: Snakemake waits for them until they end by themselves.
-            os.killpg(process.pid, signal.SIGINT)
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGINT)
             process.wait()
             raise
     if process.returncode:
