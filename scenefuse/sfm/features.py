@@ -23,7 +23,7 @@ from scenefuse.photos.cameras.given import QUARTERS, at_size, turned
 from scenefuse.photos.cameras.read_cameras import camera_of
 from scenefuse.photos.photos import Photo, check_unchanged, orientations_in, read_photos
 from scenefuse.photos.pictures import same_shape
-from scenefuse.sfm.colmap import cancellable
+from scenefuse.sfm.colmap import MIN_PHOTOS, cancellable
 
 # Fewer features in a photo than this deserve a note: blur, fog, or a wall without texture.
 FEW_FEATURES = 100
@@ -49,7 +49,7 @@ class FeatureSettings:
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"] = setting("SIMPLE_RADIAL")
     """COLMAP's camera model; focal length and distortion are refined."""
     camera_mode: Literal["auto", "single", "per_folder", "per_photo"] = setting("auto")
-    """Which photos share one camera; auto: those with one size, EXIF camera and focal length."""
+    """Which photos share one camera; auto: those with one size, EXIF camera, focal length and rotation."""
 
 
 def extract_features(
@@ -71,10 +71,10 @@ def extract_features(
     """
     listed = read_photos(photos)
     check_unchanged(folder, listed)
-    groups = camera_groups(listed, settings.camera_mode)
     known = None if calibration is None else read_calibration(calibration)
-    quarters = {} if known is None else quarter_turns(known, listed, orientations_in(read_json(photos)))
-    groups = [own for names in groups for k in range(4) if (own := [n for n in names if quarters.get(n, 0) == k])]
+    quarters = quarter_turns(known, listed, orientations_in(read_json(photos)))
+    least = 1 if known else MIN_PHOTOS
+    groups = [own for names in camera_groups(listed, settings.camera_mode) for own in by_turn(names, quarters, least)]
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = settings.max_image_size_px
     options.num_threads = threads()
@@ -110,8 +110,7 @@ def extract_features(
     few = [name for name, count in counts.items() if count < FEW_FEATURES]
     if few:
         print(f"note: {len(few)} photos have fewer than {FEW_FEATURES} features, {few[0]} for one", flush=True)
-    middle = int(np.median(list(counts.values())))
-    print(f"{middle} features in the median photo, {len(groups)} cameras", flush=True)
+    print(f"{np.median(list(counts.values())):.0f} features in the median photo, {len(groups)} cameras", flush=True)
 
 
 def camera_groups(photos: list[Photo], mode: str) -> list[list[str]]:
@@ -159,13 +158,23 @@ def read_calibration(path: Path) -> pycolmap.Camera:
         raise StageError(f"the calibration {path} is no camera of COLMAP ({error}); {form}") from None
 
 
-def quarter_turns(known: pycolmap.Camera, photos: list[Photo], orientations: Mapping[str, int]) -> dict[str, int]:
-    """How many clockwise quarters each photo was turned by, by name, since its known camera was calibrated: none where
-    the shape of one on its side shows that the camera is of upright photos."""
+def quarter_turns(
+    known: pycolmap.Camera | None, photos: list[Photo], orientations: Mapping[str, int]
+) -> dict[str, int]:
+    """How many clockwise quarters each photo was turned by, by name, since its camera took it; none where the shape of
+    one on its side shows that the known camera is of upright photos."""
     turns = {photo.name: QUARTERS.get(orientations.get(photo.name, 1), 0) for photo in photos}
-    own = known.width, known.height
-    upright = any(turns[p.name] % 2 and same_shape(own, (p.width, p.height)) for p in photos)
+    own = known and (known.width, known.height)
+    upright = own and any(turns[p.name] % 2 and same_shape(own, (p.width, p.height)) for p in photos)
     return dict.fromkeys(turns, 0) if upright else turns
+
+
+def by_turn(names: list[str], quarters: Mapping[str, int], least: int) -> list[list[str]]:
+    """Photos of one camera parted by their quarters, for its principal point turns along. Fewer than `least`, which do
+    not determine a lens of their own, stay with the most."""
+    parts = sorted(([n for n in names if quarters[n] == k] for k in range(4)), key=len, reverse=True)
+    few = [name for part in parts[1:] if len(part) < least for name in part]
+    return [parts[0] + few, *(part for part in parts[1:] if len(part) >= least)]
 
 
 def _reader_options(

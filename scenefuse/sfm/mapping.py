@@ -191,13 +191,8 @@ def _attempt(job: Job, calibrated: bool, seed: int) -> tuple[pycolmap.Reconstruc
         f"{lens.words}",
         flush=True,
     )
-    left_out = [
-        {
-            "photos": sorted(_registered_names(m)),
-            "reason": "not connected to the largest model by enough verified matches",
-        }
-        for m in ranked[1:]
-    ]
+    reason = "not connected to the largest model by enough verified matches"
+    left_out = [{"photos": sorted(_registered_names(m)), "reason": reason} for m in ranked[1:]]
     for entry in left_out:
         print(f"note: a separate model of {len(entry['photos'])} photos is left out", flush=True)
     return model, {

@@ -541,6 +541,32 @@ def test_a_calibration_is_turned_along_with_photos_that_exif_rotates(tmp_path, s
     assert [c.params.tolist() for c in found] == (turned if stored else [[9, 9, 50, 70]] * 3)
 
 
+def test_photos_that_exif_turns_otherwise_have_a_camera_of_their_own_unless_they_are_few(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for index, orientation in enumerate((1, 3, 1, 3, 1, 3, 1, 6, 8, 8, 8)):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        noise = np.random.default_rng(index).integers(0, 255, (24, 32, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / "photos" / f"{index:02}.png", exif=exif)
+    list_photos(
+        source=tmp_path / "photos",
+        upright=tmp_path / "upright",
+        photos=tmp_path / "photos.json",
+        settings=VideoSettings(),
+    )
+    extract_features(
+        folder=tmp_path / "upright",
+        photos=tmp_path / "photos.json",
+        features=tmp_path / "features.db",
+        settings=FEATURES,
+    )
+    with pycolmap.Database.open(tmp_path / "features.db") as opened:
+        cameras = {i.name: i.camera_id for i in opened.read_all_images()}
+    # Three upside down have their own; one quarter turn to the right does not, beside three to the left.
+    shared = [{n[:2] for n in cameras if cameras[n] == number} for number in set(cameras.values())]
+    assert sorted(map(sorted, shared)) == [["00", "02", "04", "06"], ["01", "03", "05"], ["07", "08", "09", "10"]]
+
+
 LENSES = {
     "OPENCV": [180.0, 182, 118, 92, -0.12, 0.02, 0.001, -0.001],
     "SIMPLE_RADIAL": [190.0, 120, 90, 0.05],
