@@ -49,7 +49,7 @@ class Spread:
 
         Each model's similarity of the 200 points nearest to the place is a deviation; those of a jackknife of K groups
         add (K - 1) / K times the squares about their mean, the others their squares. None where no photos could be left
-        out: three at most, or all on one line.
+        out: three at most.
         """
         near = np.argsort(np.linalg.norm(self.points - place, axis=1))[:NEAREST_POINTS]
         deviations, whole = [], []
@@ -95,21 +95,17 @@ def spread_of(model: pycolmap.Reconstruction, lens: Lens, beyond: Lens | None) -
     points = np.array([model.points3D[p].xyz for p in ids]).reshape(-1, 3)
     names = sorted((model.images[i].name, i) for i in model.reg_image_ids())
     groups = min(GROUPS, len(names)) if len(names) > MIN_PHOTOS else 0
-    moved, whole = [], []
+    moved = []
     for group in range(groups):
         fewer = copy.deepcopy(model)
         for _, image in names[group::groups]:
             fewer.deregister_frame(fewer.images[image].frame_id)
         # Ten times mapping's tolerance gives the same spread to 1 % in half the time.
         adjust(fewer, lens.freedom, 10 * ADJUSTMENT_TOLERANCE)
-        if (found := _moved(fewer, model, ids)) is not None:
-            moved.append(found)
-            whole.append(False)
-    if beyond is not None and (found := _moved(beyond.fit(model), model, ids)) is not None:
-        moved.append(found)
-        whole.append(True)
-    kept = np.array(moved).reshape(-1, len(ids), 3)
-    return Spread(points, kept, np.array(whole, dtype=bool))
+        moved.append(_moved(fewer, model, ids))
+    if beyond is not None:
+        moved.append(_moved(beyond.fit(model), model, ids))
+    return Spread(points, np.array(moved).reshape(-1, len(ids), 3), np.arange(len(moved)) >= groups)
 
 
 def write_spread(path: Path, spread: Spread) -> None:
@@ -131,17 +127,17 @@ def read_spread(path: Path) -> Spread:
         raise StageError(f"{path} is no spread of a model; delete it and run the workflow again") from error
 
 
-def _moved(other: pycolmap.Reconstruction, model: pycolmap.Reconstruction, ids: list[int]) -> Array | None:
+def _moved(other: pycolmap.Reconstruction, model: pycolmap.Reconstruction, ids: list[int]) -> Array:
     """(P, 3) a model's points in another, brought into its frame by the cameras; not a number where they are gone.
 
-    None where fewer than three cameras are shared, or their centres lie on one line.
+    Of each camera the centre counts, and the ends of short axes: these turn photos in a row about it, and hardly any
+    others.
     """
-    shared = [i for i in other.reg_image_ids() if model.images[i].has_pose]
-    centres = [np.array([m.images[i].projection_center() for i in shared]) for m in (other, model)]
-    try:
-        frame = fit_sim3(np.reshape(centres[0], (-1, 3)), np.reshape(centres[1], (-1, 3)))
-    except ValueError:
-        return None
+    shared = sorted(other.reg_image_ids())
+    poses = [np.array([m.images[i].cam_from_world().inverse().matrix() for i in shared]) for m in (other, model)]
+    reach = 0.1 * np.sqrt(poses[1][:, :, 3].var(0).sum())
+    ends = [(p[:, :, 3:] + reach * p[:, :, :3] @ np.eye(3, 4, 1)).transpose(0, 2, 1).reshape(-1, 3) for p in poses]
+    frame = fit_sim3(*ends)
     missing = np.full(3, np.nan)
     there = np.array([other.points3D[p].xyz if p in other.points3D else missing for p in ids])
     return frame.apply(there)
