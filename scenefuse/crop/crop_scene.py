@@ -80,18 +80,14 @@ def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSe
     part = near[cut.keep]
     write_cloud(crop, part)
     unit = length_unit(inputs.georeference_json)
+    known = {} if inputs.georeference_json is None else read_json(inputs.georeference_json)
     about = {
         "mode": quantity(marks.mode, ""),
-        "up_cue": quantity(_up_cue(inputs.georeference_json), ""),
+        # What says which way is up in the scene; None where that is not known.
+        "up_cue": quantity(known.get("up_cue", {}).get("value"), ""),
         "fiducials": quantity(marks.fiducials, unit),
     }
     write_json(report, about | _report(len(scene), part, cut, unit))
-
-
-def _up_cue(georeference_json: Path | None) -> str | None:
-    """What says which way is up in the scene; None where that is not known."""
-    cue = None if georeference_json is None else read_json(georeference_json).get("up_cue", {}).get("value")
-    return None if cue is None else str(cue)
 
 
 def crop_of(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:

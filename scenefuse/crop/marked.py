@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from scenefuse.cloud.cloud_file import MIN_STRAY_TIMES, NEIGHBOURS
 from scenefuse.cloud.clouds import Cloud, spacing, within
 from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
@@ -16,6 +17,7 @@ from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3
 from scenefuse.crop.crop_cloud import (
     LINK_FRACTION,
     MIN_PART_SHARE,
+    REACH_FRACTION,
     STRAY_SHARE,
     Crop,
     CropSettings,
@@ -34,7 +36,7 @@ from scenefuse.geometry.depth_test import (
 from scenefuse.geometry.surface import NORMAL_NEIGHBOURS
 from scenefuse.geometry.visual_hull import MAX_BEYOND_POINTS, least_framing
 from scenefuse.marks.clicks import Clicks
-from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
+from scenefuse.marks.photo_clicks import clicks_per_photo
 from scenefuse.mvs.sparse_depths import MASK_REACH_PX, MIN_SHARED_POINTS
 from scenefuse.photos.workspace import View, Workspace, read_views, read_workspace, with_mask
 
@@ -65,7 +67,7 @@ class SceneClicks:
     names: list[str]
     inside: Array
     outside: Array
-    boxes: list[tuple[View, PhotoClicks]]
+    boxes: list[tuple[View, Array]]
     left_out: list[str]
 
     def other(self, points: Array) -> NDArray[np.bool_]:
@@ -75,22 +77,38 @@ class SceneClicks:
         and most of the wall is nearer to it than to these.
         """
         found = np.zeros(len(points), dtype=bool)
-        for view, clicks in self.boxes:
-            found |= _off_box(clicks, *view.project(points))
-        if not len(self.outside):
-            return found
+        for view, box in self.boxes:
+            found |= _off_box(box, *view.project(points), view)
         (to_outside, row), (to_inside, _) = (
             cKDTree(side).query(points, workers=threads()) for side in (self.outside, self.inside)
         )
         extent = float(np.linalg.norm(np.ptp(self.inside, axis=0)))
         for k, click in enumerate(self.outside):
             own = (row == k) & (to_outside < to_inside)
-            around = points[np.argsort(np.linalg.norm(points - click, axis=1), kind="stable")[:NORMAL_NEIGHBOURS]]
-            spread, axes = np.linalg.eigh(np.cov(around.T))
-            if spread[0] < MAX_VARIATION * spread.sum():
-                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < LINK_FRACTION * extent
+            if (plane := _plane_at(click, points, REACH_FRACTION * extent)) is not None:
+                own &= np.abs((points - plane[0]) @ plane[1]) < LINK_FRACTION * extent
             found |= own
         return found
+
+
+def _plane_at(click: Array, points: Array, reach: float) -> tuple[Array, Array] | None:
+    """A point (3,) and the normal (3,) of the plane on which the points (N, 3) about a click lie; None where they are
+    not flat. As many of them within reach as are: a few of a dense cloud are as thick as they are wide."""
+    away = np.linalg.norm(points - click, axis=1)
+    nearest, plane, count = np.argsort(away, kind="stable"), None, NORMAL_NEIGHBOURS
+    while count <= max(NORMAL_NEIGHBOURS, int(np.sum(away < reach))):
+        middle, normal, flat = _planes(points[nearest[:count]])
+        plane, count = (middle, normal) if flat else plane, 2 * count
+    return plane
+
+
+def _planes(around: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Middles (..., 3) and normals (..., 3) of planes through points (..., K, 3), and which of these lie flat on them;
+    those along a line do not."""
+    middle = around.mean(-2)
+    local = around - middle[..., None, :]
+    spread, axes = np.linalg.eigh(np.swapaxes(local, -1, -2) @ local)
+    return middle, axes[..., 0], spread[..., 0] < 2 * MAX_VARIATION * spread[..., 1]
 
 
 def locate_clicks(labels: Clicks, sparse: Path, scene: TiledCloud) -> SceneClicks:
@@ -106,6 +124,7 @@ def locate_clicks(labels: Clicks, sparse: Path, scene: TiledCloud) -> SceneClick
     """
     views = read_views(sparse)
     step = scene.spacing()
+    farthest = MIN_STRAY_TIMES * CELL_SPACINGS * step
     names: list[str] = []
     sides: tuple[list[Array], list[Array]] = ([], [])
     boxes = []
@@ -113,18 +132,20 @@ def locate_clicks(labels: Clicks, sparse: Path, scene: TiledCloud) -> SceneClick
     left_out = [f"{sentence}: left out of {labels.path}" for sentence in lost]
     for row, clicks in clicked.items():
         view = views[row]
-        points = scene.read(_behind(clicks.pixels, scene, step, view))[1].points
-        pixels, depth = view.project(points)
+        points = scene.read(_behind(clicks.pixels, scene, farthest, view))[1].points
+        (pixels, depth), tree = view.project(points), cKDTree(points)
         for pixel, inside in zip(clicks.pixels, clicks.inside):
             name = f"{'inside' if inside else 'outside'} ({pixel[0]:.0f}, {pixel[1]:.0f}) in {view.name}"
-            found = _on_surface(points, pixels, depth, pixel, step, view)
+            # Beside an object outside clicks are of the ground, however far apart the object's points lie.
+            reach = farthest if inside else CELL_SPACINGS * step
+            found = _on_surface(tree, np.abs(pixels - pixel).max(1), depth, step, reach, view)
             if found is None:
                 left_out.append(f"the click {name} of {labels.path} meets no point of the scene: left out")
             else:
                 sides[int(inside)].append(found)
                 names += [name] * bool(inside)
         if clicks.box is not None:
-            boxes.append((view, clicks))
+            boxes.append((view, clicks.box))
     if len(sides[1]) < MIN_INSIDE:
         about = f" ({'; '.join(left_out)})" if left_out else ""
         raise StageError(
@@ -134,38 +155,66 @@ def locate_clicks(labels: Clicks, sparse: Path, scene: TiledCloud) -> SceneClick
     return SceneClicks(names, np.array(sides[1]), np.array(sides[0]).reshape(-1, 3), boxes, left_out)
 
 
-def _behind(pixels: Array, scene: TiledCloud, step: float, view: View) -> Rows:
-    """The tiles of a scene that a photo may show about one of (K, 2) pixels; those that reach behind it too."""
+def _behind(pixels: Array, scene: TiledCloud, reach: float, view: View) -> Rows:
+    """The tiles of a scene that a photo may show within reach of one of (K, 2) pixels; those that reach behind it
+    too."""
     corners = [np.where(end, scene.high, scene.low) for end in np.ndindex(2, 2, 2)]
     at, depth = view.project(np.concatenate(corners))
     at, depth = at.reshape(8, -1, 2), depth.reshape(8, -1)
-    reach = np.maximum(1.0, CELL_SPACINGS * step * float(view.intrinsics[0, 0]) / np.maximum(depth.min(0), step))
-    low, high = at.min(0) - reach[:, None], at.max(0) + reach[:, None]
-    shown = ((pixels[:, None] >= low) & (pixels[:, None] <= high)).all(2).any(0)
-    return np.flatnonzero((depth.max(0) > 0) & (shown | (depth.min(0) <= step)))
+    around = _pixels_of(reach, np.maximum(depth.min(0), reach), view)[:, None]
+    shown = ((pixels[:, None] >= at.min(0) - around) & (pixels[:, None] <= at.max(0) + around)).all(2).any(0)
+    return np.flatnonzero((depth.max(0) > 0) & (shown | (depth.min(0) <= reach)))
 
 
-def _on_surface(points: Array, pixels: Array, depth: Array, pixel: Array, step: float, view: View) -> Array | None:
-    """The middle (3,) of the nearest points (N, 3) that a photo shows about a pixel; None where there are none."""
-    focal = float(view.intrinsics[0, 0])
-    with np.errstate(divide="ignore"):
-        reach = np.maximum(1.0, CELL_SPACINGS * step * focal / depth)  # a pixel at least
-    rows = np.flatnonzero((depth > 0) & (np.abs(pixels - pixel).max(1) <= reach))
+def _pixels_of(length: float | Array, depth: Array, view: View) -> Array:
+    """Pixels of lengths at positive depths (N,), one at least."""
+    return np.maximum(1.0, length * view.intrinsics[0, 0] / depth)
+
+
+def _on_surface(tree: cKDTree, off: Array, depth: Array, step: float, farthest: float, view: View) -> Array | None:
+    """The middle (3,) of the nearest points that a photo shows about a pixel; None where there are none.
+
+    About a pixel are those within two steps. Where the scene shows little, as of what a drone saw obliquely, a pixel
+    falls between its points on what is behind: what lies flat, or not much farther apart than usual, is about it within
+    the distance of its eighth neighbours, up to `farthest`, and counts where it hides the others.
+
+    Args:
+        tree: of points (N, 3) of the scene.
+        off: (N,) pixels between them and the pixel, along the axis where these are more.
+        depth: (N,) their depths.
+        step: usual spacing.
+        farthest: as far apart as points of a surface may lie.
+        view: of the photo.
+    """
+    ahead, thick = np.flatnonzero(depth > 0), SURFACE_SPACINGS * step
+    rows = ahead[off[ahead] <= _pixels_of(farthest, depth[ahead], view)]
     if not len(rows):
         return None
-    # A single point that floats before the surface does not say where it is.
-    ahead, thick = np.sort(depth[rows]), SURFACE_SPACINGS * step
+    away, neighbours = tree.query(tree.data[rows], min(NEIGHBOURS + 1, tree.n), workers=threads())
+    apart = np.where(_planes(tree.data[neighbours])[2] | (away[:, -1] <= thick), away[:, -1], 0.0)
+    near, hiding = (
+        _front(rows[off[rows] <= _pixels_of(np.maximum(reach, CELL_SPACINGS * step), depth[rows], view)], depth, thick)
+        for reach in (0.0, apart)
+    )
+    if len(hiding) and (not len(near) or depth[hiding].min() < depth[near].min() - thick):
+        near = hiding
+    return np.median(tree.data[near], axis=0) if len(near) else None
+
+
+def _front(rows: Rows, depth: Array, thick: float) -> Rows:
+    """The rows in front, within a thickness; a single one that floats before the surface does not say where it is."""
+    ahead = np.sort(depth[rows])
     crowd = np.searchsorted(ahead, ahead + thick, side="right") - np.arange(len(ahead)) >= MIN_INSIDE
-    nearest = ahead[crowd.argmax()]
-    front = rows[(depth[rows] >= nearest) & (depth[rows] <= nearest + thick)]
-    return np.median(points[front], axis=0)
+    nearest = ahead[crowd.argmax()] if len(rows) else 0.0
+    return rows[(depth[rows] >= nearest) & (depth[rows] <= nearest + thick)]
 
 
-def _off_box(clicks: PhotoClicks, pixels: Array, depth: Array) -> NDArray[np.bool_]:
-    """(N,) which of the projected points lie outside the box clicked in the photo."""
-    if clicks.box is None:
-        return np.zeros(len(depth), dtype=bool)
-    return (depth <= 0) | (pixels < clicks.box[0]).any(1) | (pixels > clicks.box[1]).any(1)
+def _off_box(box: Array, pixels: Array, depth: Array, view: View) -> NDArray[np.bool_]:
+    """(N,) which of the projected points lie outside the box (2, 2) clicked in a photo; where it ends at the photo's
+    edge, the object may go on."""
+    last = np.array([view.width, view.height]) - 1
+    low, high = np.where(box[0] < 1, -np.inf, box[0]), np.where(box[1] > last, np.inf, box[1])
+    return (depth <= 0) | (pixels < low).any(1) | (pixels > high).any(1)
 
 
 def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, other: NDArray[np.bool_]) -> Crop:

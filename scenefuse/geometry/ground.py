@@ -102,9 +102,7 @@ def _lowest(points: Array, corner: Array, edge: float) -> Array:
     cell = np.floor((points[:, :2] - corner) / edge).astype(np.int64)
     key = cell[:, 0] * (2 * CELLS) + cell[:, 1]
     order = np.lexsort((points[:, 2], key))
-    first = np.concatenate([[True], key[order][1:] != key[order][:-1]])
-    starts = np.flatnonzero(first)
-    counts = np.diff(np.concatenate([starts, [len(order)]]))
+    _, starts, counts = np.unique(key[order], return_index=True, return_counts=True)
     return points[order[starts + (0.1 * counts).astype(int)]]
 
 

@@ -14,10 +14,7 @@ from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
 from scenefuse.geometry.icp import MAX_TRIPLES, RANSAC_POSES, ScaleRange, refine_points, triples_of_one_scale
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare, with_grid, with_queries
-from scenefuse.register.problem import (
-    SURFACE_POINTS,
-    Problem,
-)
+from scenefuse.register.problem import SURFACE_POINTS, Problem
 from scenefuse.register.score import RECALL_WEIGHT, Hypothesis, best_distinct, score
 
 Candidate = tuple[Sim3, str]

@@ -326,32 +326,27 @@ def cut_scene(
     settings: CropSettings,
     up_in_scene: Array | None = None,
     fiducials: Path | None = None,
-    box: Array | None = None,
+    boxed: bool = False,
     total: int | None = None,
 ) -> tuple[Cloud, str]:
     """The part of a scene in which the object is looked for, and what it is in words.
 
     Args:
-        scene: the whole scene, or what of it lies in `search_box`.
+        scene: the whole scene, or what of it lies in `search_box`; of a crop box no more.
         settings: of the crop.
         up_in_scene: opposite to gravity; without it, no ground is removed around fiducials.
         fiducials: file of at least four points on the object in the scene's coordinates: tab-separated with the header
             `point x y z` (TSV), or any cloud file.
-        box: (6,) least x, y, z and greatest x, y, z.
+        boxed: whether a crop box is given.
         total: points of the whole scene, where this is a part.
 
     Raises:
-        StageError: bad fiducials, or an empty box.
+        StageError: bad fiducials.
     """
     total = len(scene) if total is None else total
-    if box is not None:
-        inside = (scene.points >= box[:3]) & (scene.points <= box[3:])
-        part = scene[np.flatnonzero(inside.all(1))]
-        if not len(part):
-            raise StageError("no scene point lies in the crop box; give least x y z, then greatest x y z")
-        return part, f"the crop box, {len(part)} points in a scene of {total}"
     if fiducials is None:
-        return scene, f"the whole scene, {total} points"
+        said = f"the crop box, {len(scene)} points in a scene of {total}"
+        return scene, said if boxed else f"the whole scene, {total} points"
     names, marks = _fiducials(fiducials)
     if up_in_scene is None:
         settings, up_in_scene = replace(settings, remove_ground=False), UP
@@ -373,11 +368,9 @@ def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, An
     pose, outcome = found.scene_from_object, found.outcome
     if pose is not None and outcome is not None:
         best, decision = outcome.ranked[0], outcome.decision
-        unit = f"{found.unit} per object unit"
-        content |= pose_quantities(best)
-        content |= {
+        content |= pose_quantities(best) | {
             "scene_from_object": quantity(pose.matrix, ""),
-            "scale": quantity(pose.scale, unit),
+            "scale": quantity(pose.scale, f"{found.unit} per object unit"),
             "margin": quantity(decision.margin, "1"),
             "free_axis": quantity(decision.free_axis, ""),
             **uncertainty_quantities(outcome.stated, found.unit),
@@ -399,9 +392,8 @@ def summary(found: Registration, searched: str, ups: tuple[Array, Array] | None)
     lines = [f"{'registered' if found.registered else 'unregistered'}: {found.reason}"]
     low, high = found.scales.clamp(0.0), found.scales.clamp(np.inf)
     held = f"held at {low:.6g}" if found.scales.width == 0 else f"started from {low:.4g} to {high:.4g}"
-    scale = (
-        "" if found.scene_from_object is None else f"{found.scene_from_object.scale:.6g} {found.unit} per object unit, "
-    )
+    pose = found.scene_from_object
+    scale = "" if pose is None else f"{pose.scale:.6g} {found.unit} per object unit, "
     lines.append(f"scale      {scale}{held}")
     lines.append(f"evidence   {evidence_of(found, ups)}")
     lines.append(f"searched   {searched}; gravity {'known' if ups is not None else 'not known'} on both sides")

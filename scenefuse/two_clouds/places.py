@@ -40,10 +40,7 @@ def likely_places(
         most: parts at most.
     """
     directions = [up] if up is not None else _thinnest(scene)
-    found = []
-    for direction in directions:
-        points = scene.points @ rotation_between(direction, UP).T
-        found += [(direction, rows) for rows in _raised(points)]
+    found = [(up, rows) for up in directions for rows in _raised(scene.points @ rotation_between(up, UP).T)]
     views = [_signature(view, seed) for view in _views(_thin(obj, seed))]
     alike = [max(_alike(_signature(_thin(scene[rows], seed), seed), view) for view in views) for _, rows in found]
     places: list[Rows] = []

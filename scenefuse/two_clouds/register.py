@@ -175,12 +175,10 @@ def _command(
 ) -> str:
     """What was typed, without what marked a part of the scene."""
     words = ["scenefuse", "register", "--object", object, "--scene", scene, "--out", out, *["--fuse"] * fuse]
-    words += [] if format == "ply" else ["--format", format]
-    words += [] if config is None else ["--config", config]
-    words += [] if seed is None else ["--seed", seed]
-    for name in ("up_object", "up_scene", "scale", "scale_range"):
-        if (given := getattr(known, name)) is not None:
-            words += [f"--{name.replace('_', '-')}", *np.atleast_1d(given)]
+    options: dict[str, Any] = {"format": None if format == "ply" else format, "config": config, "seed": seed}
+    options |= {name: getattr(known, name) for name in ("up_object", "up_scene", "scale", "scale_range")}
+    for name, given in options.items():
+        words += [] if given is None else [f"--{name.replace('_', '-')}", *np.atleast_1d(given)]
     return shlex.join(map(str, words))
 
 
@@ -233,7 +231,7 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
         )
     # Marks around which nothing lies are far from all of the scene, which the crop says.
     near = whole.part if len(whole.part) else Cloud(whole.summary.sample)
-    part, searched = cut_scene(near, settings.crop, up_scene, known.fiducials, box, whole.summary.count)
+    part, searched = cut_scene(near, settings.crop, up_scene, known.fiducials, box is not None, whole.summary.count)
     part, strays = without_strays(part, f"what is searched of {scene}")
     notes += strays
     for each, path in ((own, object), (part, scene)):
