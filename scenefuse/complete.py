@@ -79,6 +79,10 @@ def complete(
         if given:
             cells = {default_name(o): cell_of(path, project) for o, path in zip(photographed, given)}
             fill(project / OBJECTS, column, cells)
+    masked = [name for name, row in read_table(project / OBJECTS, "object").items() if row.get("masks")]
+    if prompts and not masks and masked:
+        # An earlier run's masks would go before these clicks.
+        fill(project / OBJECTS, "masks", dict.fromkeys({*masked} & {*map(default_name, photographed)}, ""))
     for name in _without_clicks(project, cores):
         _click(project, name, shows)
     _run_workflow(project, [], cores)
@@ -139,7 +143,9 @@ def _without_clicks(project: Path, cores: int | None) -> list[str]:
     found = []
     for name, row in read_table(project / OBJECTS, "object").items():
         clicks = project / (row.get("prompts") or f"config/{name}_prompts.tsv")
-        if row.get("photos") and not row.get("masks") and not (clicks.is_file() and len(read_cells(clicks)) > 1):
+        # A cloud with its cameras is cut by clicks, if there are any.
+        needed = row.get("photos") and not row.get("masks") and (row.get("prompts") or not row.get("cloud"))
+        if needed and not (clicks.is_file() and len(read_cells(clicks)) > 1):
             found.append(name)
             frames = Path("results/objects", name, "photos.json")
             if (project / row["photos"]).is_file() and not (project / frames).is_file():

@@ -146,7 +146,23 @@ def test_masks_take_the_place_of_clicks(two_folders, workflow):
     workflow(SUMMARY)
     (two_folders / "drawn").mkdir()
     run("close", masks=(Path("drawn"),))
-    assert read_table(Path("flight_completed/config/objects.tsv"), "object")["close"]["masks"]
+    table = Path("flight_completed/config/objects.tsv")
+    assert read_table(table, "object")["close"]["masks"]
+    # And clicks that of masks, which would go before them.
+    workflow("")
+    run("close", prompts=(Path("clicks.tsv"),))
+    row = read_table(table, "object")["close"]
+    assert row["prompts"] == str(two_folders / "clicks.tsv") and not row["masks"]
+
+
+def test_a_cloud_with_its_cameras_needs_no_clicks(two_folders, workflow):
+    workflow(SUMMARY)
+    run("close", prompts=(Path("clicks.tsv"),))
+    table = Path("flight_completed/config/objects.tsv")
+    row = read_table(table, "object")["close"] | {"cameras": "cameras", "cloud": "close.ply", "prompts": ""}
+    table.write_text("\t".join(row) + "\n" + "\t".join(row.values()) + "\n")
+    workflow("")
+    run("close")
 
 
 @pytest.mark.parametrize(
