@@ -21,6 +21,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial import Delaunay, QhullError
 from scipy.spatial.distance import cdist
 
 from scenefuse.core.stage import (
@@ -214,7 +215,8 @@ def choose_pairs(
 def spatial_pairs(photos: list[Photo], neighbours: int) -> list[Pair]:
     """Each photo whose position is known with its nearest ones by GPS.
 
-    A minimum spanning tree over the positions is added, so that no group of photos stays apart.
+    A minimum spanning tree over the positions is added, so that no group of photos stays apart, and their Delaunay
+    triangulation: where a strip's photos are close, or look in five directions each, all the nearest are in that strip.
     """
     names, positions = gps_positions(photos)
     metric = _metric(positions)
@@ -226,6 +228,9 @@ def spatial_pairs(photos: list[Photo], neighbours: int) -> list[Pair]:
     # Coincident positions would be no edge at all in a sparse graph, hence the small constant.
     tree = minimum_spanning_tree(distance + 1e-6).tocoo()
     chosen = set(zip(tree.row.tolist(), tree.col.tolist()))
+    with contextlib.suppress(QhullError):  # positions on one line
+        for triangle in Delaunay(metric[:, :2]).simplices.tolist():
+            chosen |= set(combinations(triangle, 2))
     for row in rows.tolist():
         others = [c for c in by_ground[row] if c != row][: neighbours // 2]
         others += [c for c in by_space[row] if c != row and c not in others][: neighbours - len(others)]

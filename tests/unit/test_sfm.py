@@ -115,6 +115,14 @@ def test_flights_up_a_facade_and_flights_at_two_heights_hold_together():
     assert len(spatial_pairs(unknown, 10)) > 0
 
 
+def test_strips_of_close_photos_hold_together():
+    flight = [photo(f"{s}_{k:02d}.jpg", (2.0 * k, 40.0 * s + 0.1 * (k % 3), 80.0)) for s in range(4) for k in range(40)]
+    pairs = spatial_pairs(flight, 20)
+    between = [(int(a[0]), int(b[0])) for a, b in pairs if a[0] != b[0]]
+    # By the nearest alone there are three.
+    assert min(between.count((s, s + 1)) for s in range(3)) >= 40
+
+
 def test_positions_that_a_phone_repeats_do_not_choose_the_pairs():
     """A phone writes its last fix into dozens of photos: all distances among these are 0."""
     repeated = [photo(f"{i:03d}.jpg", (40.0 * (i // 30), 0.0, 50.0)) for i in range(120)]
