@@ -167,8 +167,7 @@ def _click(project: Path, name: str, shows: bool) -> None:
         raise StageError(f"{name} has no clicks yet, and there is no screen to click on; {by_file}")
     print(f"{name}: click on it in the page{'' if shows else f' below; without a browser, {by_file}'}", flush=True)
     command = [sys.executable, "-m", "scenefuse", "pick", "--object", name, *([] if shows else ["--no-browser"])]
-    status = subprocess.run(command, cwd=project, env=_environment()).returncode
-    if status or name in _without_clicks(project, None):
+    if subprocess.run(command, cwd=project, env=_environment()).returncode or name in _without_clicks(project, None):
         raise StageError(f"{name} has no clicks yet; run the same command again and click on it, or {by_file}")
 
 

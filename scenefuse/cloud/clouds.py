@@ -148,21 +148,24 @@ def within(points: NDArray[np.float64], others: NDArray[np.float64], reach: floa
     return np.isfinite(away)
 
 
-def spacing(points: NDArray[np.float64], seed: int = 0, quantile: float = 0.5) -> float:
+def spacing(points: NDArray[np.float64], seed: int = 0, quantile: float = 0.5, cell: float = 0.0) -> float:
     """Median (or other quantile) distance from a point to its nearest neighbour elsewhere, by a seeded sample; 0 where
-    all are in one place. Of points that coincide, as in a scan that was merged twice, one counts."""
-    distance = _to_nearest(points, seed)
+    all are in one place. Of points that coincide, as in a scan that was merged twice, one counts; of the points in a
+    cell, where its edge is given, too: then what was measured densely does not stand for all."""
+    distance = _to_nearest(points, seed, cell)
     if np.count_nonzero(distance == 0) > MAX_ODD_SHARE * len(distance):
-        distance = _to_nearest(np.unique(points, axis=0), seed)
+        distance = _to_nearest(np.unique(points, axis=0), seed, cell)
     distance = distance[distance > 0]
     return float(np.quantile(distance, quantile)) if len(distance) else 0.0
 
 
-def _to_nearest(points: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:
-    """Distances from up to 5000 of (N, 3) points to their nearest neighbours; none for one point."""
+def _to_nearest(points: NDArray[np.float64], seed: int = 0, cell: float = 0.0) -> NDArray[np.float64]:
+    """Distances from up to 5000 of (N, 3) points, of one in each cell, to their nearest neighbours; none for one
+    point."""
     if len(points) < 2:
         return np.zeros(0)
-    chosen = np.random.default_rng(seed).choice(len(points), min(5000, len(points)), replace=False)
+    one = np.unique(voxels(points, cell)[0], return_index=True)[1] if cell else np.arange(len(points))
+    chosen = np.random.default_rng(seed).choice(one, min(5000, len(one)), replace=False)
     return np.asarray(cKDTree(points).query(points[chosen], k=2)[0][:, 1])
 
 

@@ -17,9 +17,9 @@ from scenefuse.geometry.surface import SCORE_FRACTION
 REACH_FRACTION = 0.05
 # Points closer than this belong to one part, as a share of the diagonal of the fiducials' box.
 LINK_FRACTION = 0.03
-# A step is left out if less than this share of the points in the box would be left: the object is there.
+# A step is left out if less than this share of the surface in the box would be left: the object is there.
 MIN_LEFT = 0.05
-# Parts with a smaller share of the points are left out.
+# Parts with a smaller share of the surface are left out.
 MIN_PART_SHARE = 0.01
 # The outermost share of points on each side marks nothing: strays, among the votes of masks for instance.
 STRAY_SHARE = MIN_PART_SHARE
@@ -109,7 +109,8 @@ def crop_cloud(
     away = np.zeros(len(points), dtype=bool)
     if ground is not None and in_box.any():
         away = on_ground(points, marks, ground, in_box)
-        if away.sum() > (1 - MIN_LEFT) * in_box.sum():
+        area = _areas(points[in_box], LINK_FRACTION * diagonal)
+        if area[away[in_box]].sum() > (1 - MIN_LEFT) * area.sum():
             cut = crop_cloud(scene, fiducials, up, replace(settings, remove_ground=False), other)
             share = f"{away.sum()} of the {in_box.sum()} points in the box"
             return replace(cut, notes=[f"{share} would be ground: nothing was removed as ground", *cut.notes])
@@ -123,28 +124,30 @@ def crop_cloud(
 def _without_loose_parts(
     points: Array, inside: NDArray[np.bool_], marks: Array, diagonal: float
 ) -> tuple[NDArray[np.bool_], list[str]]:
-    """Those of the points `inside` in parts that belong to the object, and what was not done and why."""
-    rows = np.flatnonzero(inside)
-    if not len(rows):
+    """Those of the points `inside` in large enough parts that a fiducial touches, and what was not done and why."""
+    own = points[inside]
+    if not len(own):
         return inside, []
-    link = max(LINK_FRACTION * diagonal, 3 * spacing(points[rows]))
-    near = _parts_near(points[rows], marks, link, REACH_FRACTION * diagonal)
+    cell, reach = LINK_FRACTION * diagonal, REACH_FRACTION * diagonal
+    area, (part_of, counts) = _areas(own, cell), parts(own, max(cell, 3 * spacing(own, cell=cell)))
+    # Of millions of marks and points one in each cell says as much, to an eighth of the reach.
+    one, mark = (np.unique(voxels(side, reach / 8)[0], return_index=True)[1] for side in (own, marks))
+    touched = np.bincount(part_of[one], within(own[one], marks[mark], reach), len(counts)) > 0
+    near = (touched & (np.bincount(part_of, area) >= MIN_PART_SHARE * area.sum()))[part_of]
     if not near.any():
         return inside, ["no part in the box lies near a fiducial: all of them were kept"]
-    if near.mean() < MIN_LEFT:
-        return inside, [f"parts near a fiducial have only {near.sum()} of {len(rows)} points in the box: all were kept"]
-    keep = np.zeros(len(points), dtype=bool)
-    keep[rows[near]] = True
+    if area[near].sum() < MIN_LEFT * area.sum():
+        return inside, [f"parts near a fiducial have only {near.sum()} of {len(own)} points in the box: all were kept"]
+    keep = inside.copy()
+    keep[inside] = near
     return keep, []
 
 
-def _parts_near(points: Array, marks: Array, link: float, reach: float) -> NDArray[np.bool_]:
-    """Which points belong to a large enough part that a fiducial touches."""
-    part_of, counts = parts(points, link)
-    # Of millions of marks and points one in each cell says as much, to an eighth of the reach.
-    one, mark = (np.unique(voxels(side, reach / 8)[0], return_index=True)[1] for side in (points, marks))
-    touched = np.bincount(part_of[one], within(points[one], marks[mark], reach), len(counts)) > 0
-    return (touched & (counts >= MIN_PART_SHARE * len(points)))[part_of]
+def _areas(points: Array, cell: float) -> Array:
+    """(N,) what share of its cell each point is: their sum grows with a surface, and not with how densely it was
+    measured."""
+    group, counts = voxels(points, cell)
+    return 1 / counts[group]
 
 
 def ground_under(points: Array, marks: Array, low: Array, high: Array) -> tuple[Ground | None, list[str]]:

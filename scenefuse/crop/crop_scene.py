@@ -161,8 +161,7 @@ def _located(
     if isinstance(marked, ScenePoints) and frame is not None:
         there = to_wgs84(pyproj.CRS.from_user_input(frame.crs), marked.positions, str(inputs.fiducials))
         return marked.points, frame.apply(there), None
-    names, points, _ = locate(inputs.fiducials, inputs.sparse, settings.max_residual_px)
-    return names, points, None
+    return *locate(inputs.fiducials, inputs.sparse, settings.max_residual_px)[:2], None
 
 
 def _frame_of_cloud(georeference_json: Path | None) -> LocalFrame | None:

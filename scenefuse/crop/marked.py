@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.cloud_file import MIN_STRAY_TIMES, NEIGHBOURS
-from scenefuse.cloud.clouds import Cloud, spacing, within
+from scenefuse.cloud.clouds import Cloud, occupied_voxels, spacing, within
 from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3
@@ -125,9 +125,8 @@ def locate_clicks(labels: Clicks, sparse: Path, scene: TiledCloud) -> SceneClick
     views = read_views(sparse)
     step = scene.spacing()
     farthest = MIN_STRAY_TIMES * CELL_SPACINGS * step
-    names: list[str] = []
+    names, boxes = list[str](), list[tuple[View, Array]]()
     sides: tuple[list[Array], list[Array]] = ([], [])
-    boxes = []
     clicked, lost = clicks_per_photo(labels, sparse, views, None)
     left_out = [f"{sentence}: left out of {labels.path}" for sentence in lost]
     for row, clicks in clicked.items():
@@ -220,8 +219,8 @@ def _off_box(box: Array, pixels: Array, depth: Array, view: View) -> NDArray[np.
 def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, other: NDArray[np.bool_]) -> Crop:
     """`crop_cloud` around clicks on one side of an object, grown along what they lie on, to its other sides (C5).
 
-    Each round takes the points of the last crop as its marks, until one adds no more than the points of a part that
-    would be left out. Growth ends at the ground, at gaps and at points that are something else. Where the object is
+    Each round takes the points of the last crop as its marks, until one adds no more surface than a part that would be
+    left out has. Growth ends at the ground, at gaps and at points that are something else. Where the object is
     connected with something much larger, the box around the clicks remains, and a note says so.
 
     Args:
@@ -232,16 +231,17 @@ def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, o
         other: (N,) points of the scene that are something else.
     """
     first = cut = crop_cloud(scene, inside, up, settings, other)
-    most = MAX_GROWTH * float(np.linalg.norm(np.ptp(inside, axis=0)))
+    extent = float(np.linalg.norm(np.ptp(inside, axis=0)))
     while True:
         own = without_strays(scene.points[cut.keep], STRAY_SHARE / 2)  # in each round again
         if not len(own):
             return cut
-        if np.linalg.norm(np.ptp(own, axis=0)) > most:
+        if np.linalg.norm(np.ptp(own, axis=0)) > MAX_GROWTH * extent:
             break
         marks = np.concatenate([inside, own])
         grown = crop_cloud(scene, marks, up, settings, other)
-        if grown.keep.sum() <= (1 + MIN_PART_SHARE) * cut.keep.sum():
+        before, after = (occupied_voxels(scene.points[one.keep], LINK_FRACTION * extent) for one in (cut, grown))
+        if after <= (1 + MIN_PART_SHARE) * before:
             return grown
         cut = grown
     note = (
@@ -329,8 +329,7 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
         StageError: too few photos have a mask, a mask is not of its photo's size, or too few points lie inside.
     """
     read = read_workspace(workspace)
-    files = [(masks / f"{Path(view.name).stem}.png", view) for view in read.views]
-    files = [file for file in files if file[0].is_file()]
+    files = [(path, one) for one in read.views if (path := masks / f"{Path(one.name).stem}.png").is_file()]
     if len(files) < CONFIRMING_PHOTOS:
         raise StageError(
             f"{len(files)} photos of {workspace} have a mask in {masks}, three are needed; rerun the masks"

@@ -12,7 +12,7 @@ from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import look_at
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import CropInputs, crop_scene
-from scenefuse.crop.marked import SceneClicks
+from scenefuse.crop.marked import SceneClicks, crop_grown
 from scenefuse.marks.clicks import read_points
 from scenefuse.photos.workspace import View, write_model
 
@@ -158,6 +158,16 @@ def test_a_box_that_ends_at_the_photo_s_edge_does_not_end_the_object_there(crop)
     corners = (0.0, shown[:, 1].min() - 3), tuple(shown.max(0) + 3)
     kept, _ = crop([*clicks, *(("box", corner) for corner in corners)], YARD[::2], view)
     assert kept[:4500].mean() > 0.9
+
+
+def test_from_a_dense_roof_the_crop_grows_down_walls_of_few_points():
+    """A drone that looks straight down shows a wall with a tenth of a roof's points per area."""
+    rng, walls = np.random.default_rng(0), shell(SIZE, [0, 0, 1.5], 840, 0)
+    roof = np.c_[rng.uniform([-3, -2], [3, 2], (2400, 2)), np.full(2400, 3.0)]
+    points = np.concatenate([walls[walls[:, 2] < 2.99], roof, rng.uniform([-9, -9, 0], [9, 9, 0.02], (32400, 3))])
+    corners = np.array([(-2, -1.5, 3), (2, -1.5, 3), (2, 1.5, 3), (-2, 1.5, 3)])
+    cut = crop_grown(Cloud(points), corners, np.array([0, 0, 1.0]), CropSettings(), np.zeros(len(points), bool))
+    assert cut.keep[points[:, 2] > 0.3].mean() > 0.98 and cut.keep[points[:, 2] < 0.02].mean() < 0.01
 
 
 @pytest.mark.slow

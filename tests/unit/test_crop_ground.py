@@ -200,17 +200,30 @@ def test_uneven_ground_under_a_house_goes():
     assert (cut.keep & ~own).sum() < 0.03 * cut.keep.sum() and cut.on_ground.sum() > 2000
 
 
-def pole():
-    """A thin pole on a dense lawn: nearly all points around it are ground."""
-    own, _ = block((-0.03, -0.03, 0.0), (0.03, 0.03, 3), 300)
-    marks = np.array([[0, 0, 0.05], [0, 0, 3], [0.6, 0, 2.9], [-0.6, 0, 2.9], [0, 0.6, 2.9], [0, -0.6, 2.9]])
-    bar, _ = block((-0.6, -0.03, 2.87), (0.6, 0.03, 2.93), 100)
-    return Scene(np.concatenate([own, bar]), patch((-4, 4), (-4, 4), 0.0, 500000), marks)
+def bed():
+    """A flower bed with a post in its middle: nearly all of what is there is ground."""
+    own, _ = block((-0.03, -0.03, 0.0), (0.03, 0.03, 0.3), 400)
+    marks = np.array([[0, 0, 0.3], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+    return Scene(own, patch((-4, 4), (-4, 4), 0.0, 200000), marks)
+
+
+def test_ground_goes_though_it_was_measured_much_more_densely_than_the_object():
+    own, corners = block((0, 0, 0), (6, 4, 3), 540)
+    cut, kept, rest = Scene(own, patch((-6, 12), (-6, 10), 0.0, 80000), corners).crop()
+    assert kept[own[:, 2] > 0.3].all() and not rest.any() and cut.notes == []
+
+
+def test_a_dense_bush_in_the_box_leaves_a_house_of_few_points_in_one_part():
+    own, corners = block((0, 0, 0), (6, 4, 3), 800)
+    on_sphere = np.random.default_rng(0).normal(size=(20000, 3))
+    on_sphere /= np.linalg.norm(on_sphere, axis=1, keepdims=True)
+    scene = Scene(own, np.concatenate([[6.25, 4.1, 0.6] + [0.3, 0.3, 0.6] * on_sphere, STREET]), corners)
+    assert scene.crop()[1][own[:, 2] > 0.3].all()
 
 
 @pytest.mark.slow
 def test_ground_that_would_be_nearly_everything_is_left_in_and_that_is_recorded_and_printed(tmp_path, capsys):
-    scene = pole()
+    scene = bed()
     write_cloud(tmp_path / "dense.ply", scene.cloud)
     rows = [f"p{k}\t{x}\t{y}\t{z}" for k, (x, y, z) in enumerate(scene.fiducials)]
     (tmp_path / "marks.tsv").write_text("point\tx\ty\tz\n" + "\n".join(rows) + "\n")
@@ -235,7 +248,7 @@ def test_registering_two_clouds_says_what_was_not_removed(tmp_path):
 
 
 def test_parts_are_kept_where_those_near_a_fiducial_would_be_next_to_nothing():
-    own, _ = block((-2, -0.5, 0), (-1.9, 0.5, 3), 600)
+    own, _ = block((-2, 0.3, 0), (-1.9, 0.5, 0.4), 600)
     _, marks = block((-2, -0.5, 0), (2, 0.5, 3))
     scene = Scene(own, patch(2.35, (-0.5, 0.5), (0, 3), 20000, noise=0.003), marks)
     cut, kept, rest = scene.crop(remove_ground=False)
