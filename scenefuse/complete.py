@@ -108,8 +108,8 @@ def _make_or_go_on(project: Path, flight: Path, objects: Sequence[Path], preset:
         differs = any(held.get(key) != row[key] for row, held in known for key in row if key != "prompts")
         if differs or (new and (kind == "scene" or len(known) < len(there))):
             raise StageError(
-                f"{project} holds another project ({kind}s: {', '.join(there)}); delete it, or give another folder by"
-                " --out"
+                f"{project} holds another project ({kind}s: {', '.join(there)}); give another folder by --out, or,"
+                f" where these have moved, correct {project / table}"
             )
         for added in new:
             for column, cell in added.items():

@@ -83,8 +83,16 @@ def test_the_same_command_goes_on_and_other_folders_are_another_project(two_fold
     said = capsys.readouterr().out
     assert "--preset draft is left out: the settings of this project are in flight_completed/config/config.yaml" in said
     Project(two_folders).photos("shed")
-    with pytest.raises(StageError, match=r"flight_completed holds another project \(objects: close\); delete it, or"):
+    with pytest.raises(StageError, match=r"flight_completed holds another project \(objects: close\); give another f"):
         run("shed")
+    # Photos that were moved: what was computed of them is not lost.
+    Path("moved").mkdir()
+    moved = Path("close").rename("moved/close")
+    with pytest.raises(StageError, match=r"where these have moved, correct flight_completed/config/objects\.tsv"):
+        run("moved/close")
+    table = Path("flight_completed/config/objects.tsv")
+    table.write_text(table.read_text().replace(str(two_folders / "close"), str(moved.resolve())))
+    run("moved/close")
 
 
 def test_more_objects_are_added_by_a_command_that_names_the_others_too(two_folders, workflow):
