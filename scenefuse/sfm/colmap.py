@@ -7,8 +7,8 @@ the model; its matches still are.
 
 import contextlib
 import sqlite3
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,31 +89,17 @@ def cancellable(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
 
     A handler for SIGTERM only runs in the main thread, and only between two Python instructions.
     """
-    token, ended = pycolmap.CancellationToken(), threading.Event()
-    outcome: dict[str, Any] = {}
-
-    def work() -> None:
+    token = pycolmap.CancellationToken()
+    with ThreadPoolExecutor(1) as pool:
+        job = pool.submit(function, *args, cancellation_token=token, **kwargs)
         try:
-            outcome["result"] = function(*args, cancellation_token=token, **kwargs)
-        except BaseException as error:
-            outcome["error"] = error
-        finally:
-            ended.set()
-
-    worker = threading.Thread(target=work)
-    worker.start()
-    try:
-        # Until Python 3.13, a join that a signal's exception leaves takes the thread for ended.
-        while not ended.wait(0.2):
-            pass
-    except BaseException:
-        token.cancel()
-        raise
-    finally:
-        worker.join()
-    if "error" in outcome:
-        raise outcome["error"]
-    return outcome["result"]
+            # Until Python 3.13, a join that a signal's exception leaves takes the thread for ended.
+            while not wait([job], 0.2).done:
+                pass
+        except BaseException:
+            token.cancel()
+            raise
+        return job.result()
 
 
 def require_database(path: Path) -> None:

@@ -75,12 +75,9 @@ def extract_features(
     quarters = quarter_turns(known, listed, orientations_in(read_json(photos)))
     least = 1 if known else MIN_PHOTOS
     groups = [own for names in camera_groups(listed, settings.camera_mode) for own in by_turn(names, quarters, least)]
-    options = pycolmap.FeatureExtractionOptions()
+    sift = pycolmap.SiftExtractionOptions(max_num_features=settings.max_features, first_octave=settings.first_octave)
+    options = pycolmap.FeatureExtractionOptions(num_threads=threads(), use_gpu=False, sift=sift)
     options.max_image_size = settings.max_image_size_px
-    options.num_threads = threads()
-    options.use_gpu = False
-    options.sift.max_num_features = settings.max_features
-    options.sift.first_octave = settings.first_octave
     recipe = settings, photos.read_text(), calibration and calibration.read_text()
     with resumed_file(features, *recipe) as temporary:
         with pycolmap.Database.open(temporary) as opened:

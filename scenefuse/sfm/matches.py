@@ -103,6 +103,7 @@ def match_features(
     pycolmap.set_random_seed(seed)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
+    sift = pycolmap.SiftMatchingOptions(max_ratio=settings.max_ratio, max_distance=MAX_DISTANCE, cross_check=True)
     with pycolmap.Database.open(features) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         counts = [opened.num_keypoints_for_image(number) for number in names]
@@ -118,7 +119,7 @@ def match_features(
             cancellable(
                 pycolmap.match_image_pairs,
                 temporary,
-                matching_options=_matching(settings),
+                matching_options=pycolmap.FeatureMatchingOptions(num_threads=threads(), use_gpu=False, sift=sift),
                 # COLMAP looks at a cancellation only between two blocks of pairs.
                 pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=100),
                 verification_options=verification,
@@ -143,16 +144,6 @@ def match_features(
         "inlier_matches": quantity(inliers, "1"),
     }
     write_json(matches, content)
-
-
-def _matching(settings: MatchSettings) -> pycolmap.FeatureMatchingOptions:
-    options = pycolmap.FeatureMatchingOptions()
-    options.num_threads = threads()
-    options.use_gpu = False
-    options.sift.max_ratio = settings.max_ratio
-    options.sift.max_distance = MAX_DISTANCE
-    options.sift.cross_check = True
-    return options
 
 
 @contextlib.contextmanager
