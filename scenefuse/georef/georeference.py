@@ -12,7 +12,7 @@ import pycolmap
 from scenefuse.cloud.crs import check_in_area, grid_name, projected_crs
 from scenefuse.cloud.import_cloud import near_origin
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, value, write_json
-from scenefuse.core.transforms import Array, Sim3, box_corners, fit_sim3
+from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3, box_corners, fit_sim3
 from scenefuse.georef.control import Control, read_control_points
 from scenefuse.georef.on_cloud import lay_on_cloud
 from scenefuse.georef.placement import (
@@ -24,6 +24,7 @@ from scenefuse.georef.placement import (
     Placement,
     beside_gps,
     middle_of,
+    of_one_zero,
     place_by_control,
     place_by_gps,
     scaled,
@@ -157,6 +158,7 @@ def georeference(
         sure_up: whether `up` is a measurement (`estimate_up`: "headings"), better than inexact heights.
     """
     by_gps = settings.use_gps and len(gps.names) >= PHOTOS_OF_ONE_ERROR
+    gps, zeros = of_one_zero(gps, MAX_DEVIATIONS * settings.gps_accuracy_m) if by_gps else (gps, "")
     if control is not None:
         positions = np.array([s.point.position for s in control.located])
         frame = replace(local_frame(positions), grid=control.grid)
@@ -165,11 +167,13 @@ def georeference(
         if by_gps:
             positions = frame.apply(gps.positions)
             placement = beside_gps(placement, control.located, there, gps, positions, where, settings)
+            placement = replace(placement, reason=placement.reason + zeros)
         return Georeference(placement, frame, gps, replace(control, notes=[*control.notes, *notes]))
     if by_gps:
         frame = local_frame(gps.positions)
         there, sd_m = frame.apply(gps.positions), float(np.median(gps.sd_m[:, 0]))
-        return Georeference(place_by_gps(gps.centres, there, up, settings, seed, sd_m, sure_up), frame, gps)
+        placement = place_by_gps(gps.centres, there, up, settings, seed, sd_m, sure_up)
+        return Georeference(replace(placement, reason=placement.reason + zeros), frame, gps)
     reason = f"{len(gps.names)} registered photos have a GPS position, {PHOTOS_OF_ONE_ERROR} are needed"
     return Georeference(upright(up, reason if settings.use_gps else "GPS is switched off"), None, gps)
 

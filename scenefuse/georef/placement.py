@@ -88,6 +88,34 @@ class GpsCameras:
     sd_m: Array
 
 
+def of_one_zero(gps: GpsCameras, least_m: float) -> tuple[GpsCameras, str]:
+    """GPS heights of two flights that count from different zeros, as ellipsoid and sea, brought to that of more photos;
+    and what was done, "" for nothing. Such a step turns the model, and residuals hardly show it.
+
+    Args:
+        gps: photos in the order of their names: one flight after the other.
+        least_m: what a step has to exceed. It also has to explain more than half of the squared heights that no
+            similarity does.
+    """
+    known = np.flatnonzero(np.isfinite(gps.positions[:, 2]))
+    if len(known) < 4 * PHOTOS_OF_ONE_ERROR:
+        return gps, ""
+    steps = np.tri(len(known), k=-1)[:, PHOTOS_OF_ONE_ERROR - 1 : -PHOTOS_OF_ONE_ERROR]
+    explained = np.linalg.qr(np.c_[gps.centres[known], np.ones(len(known))])[0]
+    off, left = (part - explained @ (explained.T @ part) for part in (gps.positions[known, 2], steps))
+    sizes = (left.T @ off) / np.maximum((left**2).sum(0), 1e-9)
+    gains = sizes * (left.T @ off)
+    at = int(np.argmax(gains))
+    if abs(sizes[at]) <= least_m or gains[at] < off @ off / 2:
+        return gps, ""
+    late = steps[:, at] > 0
+    few, shift = (late, -sizes[at]) if late.mean() < 0.5 else (~late, sizes[at])
+    positions = gps.positions.copy()
+    positions[known[few], 2] += shift
+    note = f"; GPS heights of {few.sum()} photos are moved by {shift:+.1f} m, to the zero of the others"
+    return replace(gps, positions=positions), note
+
+
 def place_by_control(
     located: list[LocatedPoint], target: Array, up: Array, where: str, seed: int
 ) -> tuple[Placement, list[str]]:

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.cloud.crs import read_crs, to_wgs84
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.core.transforms import Sim3, rotation_angle_deg
-from scenefuse.georef.georeference import camera_poses, georegister
-from scenefuse.georef.placement import GeoreferenceSettings, fit_level, place_by_gps
+from scenefuse.core.transforms import UP, Sim3, rotation_angle_deg
+from scenefuse.georef.georeference import camera_poses, georeference, georegister
+from scenefuse.georef.placement import GeoreferenceSettings, GpsCameras, fit_level, place_by_gps
 from scenefuse.photos.geodesy import GridFrame, LocalFrame, local_frame, scene_frame
 from scenefuse.photos.photos import Photo, write_photos
 from scenefuse.photos.workspace import View, write_model
@@ -226,6 +226,29 @@ def test_a_fix_that_a_phone_writes_into_dozens_of_photos_counts_once():
         found = place_by_gps(around / 10, target, np.array([0.0, 0, 1]), GeoreferenceSettings(), 0)
         assert found.inliers.sum() > 30 and not found.inliers[31:58].any()
         assert found.local_from_model.scale == pytest.approx(10, rel=0.04)
+
+
+def test_heights_of_two_flights_that_count_from_different_zeros_do_not_tilt_the_model():
+    truth = flight(rows=6)
+    noisy = truth + np.random.default_rng(0).normal(0, 1, truth.shape)
+    photos = [f"{k:02d}.jpg" for k in range(36)]
+    counted = noisy + np.where(np.arange(36) < 17, 16.0, 0.0)[:, None] * UP
+    found = [
+        georeference(
+            GpsCameras(photos, PLANTED.inverse().apply(truth), FRAME.inverse(there), np.full((36, 2), 2.0)),
+            None,
+            PLANTED.inverse().rotate(UP),
+            SETTINGS,
+            0,
+        )
+        for there in (noisy, counted)
+    ]
+    assert [f.placement.status for f in found] == ["georeferenced"] * 2
+    tilts = [f.placement.local_from_model.rotate(PLANTED.inverse().rotate(UP)) @ UP for f in found]
+    assert np.degrees(np.arccos(tilts)).max() < 2
+    assert abs(found[1].placement.local_from_model.scale / PLANTED.scale - 1) < 0.02
+    np.testing.assert_allclose(found[1].gps.positions[:, 2], 430 + noisy[:, 2], atol=1.5)
+    assert ["heights of 17 photos are moved by -1" in f.placement.reason for f in found] == [False, True]
 
 
 def test_positions_that_hardly_move_give_no_scale():
