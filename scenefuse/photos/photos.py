@@ -264,11 +264,10 @@ def read_photos(path: Path) -> list[Photo]:
 def gps_positions(photos: list[Photo]) -> tuple[list[str], NDArray[np.float64]]:
     """Names and (N, 3) WGS84 latitude (deg), longitude (deg), altitude (m) of the photos that have a position.
 
-    A missing altitude is NaN; so are those of a receiver that has none, and writes 0 throughout.
+    A missing altitude is NaN; so is one of exactly 0, which receivers write that have none.
     """
     known = [p for p in photos if p.has_gps]
-    none = not any(p.altitude_m for p in known)
-    rows = [(p.latitude_deg, p.longitude_deg, np.nan if none or p.altitude_m is None else p.altitude_m) for p in known]
+    rows = [(p.latitude_deg, p.longitude_deg, p.altitude_m or np.nan) for p in known]
     return [p.name for p in known], np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 

@@ -161,6 +161,13 @@ def test_heights_of_zero_throughout_are_unknown(tmp_path):
     assert np.ptp(centres[:, 2]) == pytest.approx(np.ptp(flight.centres[:, 2]), rel=0.02)
 
 
+def test_a_height_of_zero_beside_others_is_unknown(tmp_path, model):
+    photos = [replace(photo, altitude_m=0.0) if k % 5 else photo for k, photo in enumerate(FLIGHT.photos(0.5))]
+    report, _, _ = georeferenced(tmp_path, model, photos)
+    assert (value(report, "heights"), value(report, "gps_outliers")) == ("measured", [])
+    assert value(report, "origin_altitude_m") == pytest.approx(490, abs=2) and "19 of them" in value(report, "reason")
+
+
 def test_positions_along_one_line_do_not_tilt_the_model(tmp_path, model):
     in_line = [p if k // 6 == 1 else replace(p, latitude_deg=None) for k, p in enumerate(FLIGHT.photos(noise_m=0.5))]
     report, _, _ = georeferenced(tmp_path, model, in_line)
