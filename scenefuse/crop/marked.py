@@ -187,8 +187,6 @@ def _on_surface(tree: cKDTree, off: Array, depth: Array, step: float, farthest: 
     """
     ahead, thick = np.flatnonzero(depth > 0), SURFACE_SPACINGS * step
     rows = ahead[off[ahead] <= _pixels_of(farthest, depth[ahead], view)]
-    if not len(rows):
-        return None
     away, neighbours = tree.query(tree.data[rows], min(NEIGHBOURS + 1, tree.n), workers=threads())
     apart = np.where(_planes(tree.data[neighbours])[2] | (away[:, -1] <= thick), away[:, -1], 0.0)
     near, hiding = (

@@ -1,6 +1,6 @@
 """What a registration is given: two clouds, a prior of the scale by their extents, and what is known beside them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -120,6 +120,13 @@ class Problem:
         """
         voxel = fraction * self.scene.diagonal
         return prepare(self.object, voxel / scale, self.seed, most), prepare(self.scene, voxel, self.seed, most)
+
+
+def comparable(obj: Cloud, scene: Cloud) -> tuple[Cloud, Cloud]:
+    """Object and scene, both without colours where only one of them is grey: how bright a laser's echo is, at its
+    wavelength, is no colour."""
+    grey = [c.colors is None or not np.ptp(c.colors, axis=1).any() for c in (obj, scene)]
+    return (obj, scene) if grey[0] == grey[1] else (replace(obj, colors=None), replace(scene, colors=None))
 
 
 def check_extent(cloud: Cloud, name: str) -> None:

@@ -20,6 +20,7 @@ from scenefuse.register.problem import (
     Inputs,
     Problem,
     ScaleSettings,
+    comparable,
     estimates,
     prior,
     read_alignment,
@@ -103,7 +104,7 @@ def register_object(
     """
     (obj, scene), ups = inputs.clouds(), inputs.ups()
     ledger = estimates(obj, scene, ups)
-    problem = Problem(obj, scene, prior(ledger, scale), Constraints(ups), seed)
+    problem = Problem(*comparable(obj, scene), prior(ledger, scale), Constraints(ups), seed)
     write_json(scale_report, scale_quantities(ledger, problem.scales, scale.method))
     found, notes = hypotheses_or_centres(problem, coarse)
     write_json(coarse_report, coarse_quantities(found, ups is not None, notes))

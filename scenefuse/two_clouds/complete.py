@@ -123,8 +123,7 @@ def _write_report(path: Path, done: Completed, object: Path, scene: CloudFile, n
     """Write completed.json, and print the notes."""
     for note in notes:
         print(f"note       {note}", flush=True)
-    crs = las_crs(scene.summary.path)
-    unit, name = unit_and_name(crs)
+    unit, name = unit_and_name(las_crs(scene.summary.path))
     earlier = {str(number): f"{number} in {scene.summary.path.name}" for number in range(Source.OBJECT, done.source)}
     kept = scene.summary.count - len(done.removed)
     content = {

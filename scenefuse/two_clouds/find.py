@@ -20,7 +20,7 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.marks.clicks import ScenePoints, read_points
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg
-from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, estimates, prior
+from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, comparable, estimates, prior
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.register_object import pose_quantities, rests_on
 from scenefuse.register.score import DISTINCT_SHIFT, AgreementSettings, Hypothesis, lead, registration_metrics
@@ -173,7 +173,7 @@ def search(
     near_obj, near_scene = (_searched(cloud, at, seed) for cloud, at in zip((obj, scene), origins))
     if scales is None:
         scales = prior(estimates(near_obj, near_scene, ups), settings.scale)
-    problem = Problem(near_obj, near_scene, scales, Constraints(ups), seed)
+    problem = Problem(*comparable(near_obj, near_scene), scales, Constraints(ups), seed)
     return Search(problem, origins, find_hypotheses(problem, settings.coarse))
 
 

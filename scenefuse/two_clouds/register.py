@@ -116,8 +116,7 @@ def register(
         print(f"note       {note}", flush=True)
     if scales is not None:
         _check_size(scales, given)
-    crs = las_crs(scene)
-    unit, _ = unit_and_name(crs)
+    unit, _ = unit_and_name(las_crs(scene))
     # A box holds the ground and what stands beside the object, too.
     marked, boxed = known.fiducials is not None, known.crop_box is not None
     whole = given.scene.part

@@ -26,11 +26,21 @@ from scenefuse.register.coarse import (
     upright_candidates,
 )
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, ScaleSettings, estimates, prior
+from scenefuse.register.problem import (
+    Alignment,
+    Constraints,
+    Inputs,
+    Problem,
+    ScaleSettings,
+    comparable,
+    estimates,
+    prior,
+)
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.register_object import register_object
 from scenefuse.register.score import color_agreement, score
 from scenefuse.register.uncertainty import COMMON_ERROR, common_error
+from scenefuse.two_clouds import find
 
 Z = np.array([0.0, 0.0, 1.0])
 COARSE, FINE = CoarseSettings(), FineSettings()
@@ -188,6 +198,18 @@ def test_color_agreement_ignores_gain_and_bias_but_not_place(house):
     assert color_agreement(a, b, pairs) > 0.99
     shuffled = Cloud(cloud.points, cloud.normals, np.random.default_rng(0).permutation(cloud.colors))
     assert color_agreement(a, prepare(shuffled, 0.01, 0, 4000), pairs) < 0.3
+
+
+def test_colours_do_not_count_where_only_one_cloud_has_some(house, monkeypatch):
+    """The other's are how bright a laser's echoes are."""
+    grey = [replace(c, colors=np.repeat(c.colors[:, :1], 3, axis=1)) for c in (house.object, house.scene)]
+    for odd in ((house.object, grey[1]), (grey[0], house.scene)):
+        assert all(cloud.colors is None for cloud in comparable(*odd))
+    for alike in ((house.object, house.scene), tuple(grey)):
+        assert comparable(*alike) == alike
+    monkeypatch.setattr(find, "find_hypotheses", lambda problem, settings: [])
+    searched = find.search(house.object, grey[1], find.RegistrationSettings(), 0, None, None).problem
+    assert searched.object.colors is None and searched.scene.colors is None
 
 
 @pytest.mark.parametrize(("of_object", "of_scene", "used"), [
