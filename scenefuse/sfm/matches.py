@@ -35,7 +35,7 @@ from scenefuse.core.stage import (
     value,
     write_json,
 )
-from scenefuse.photos.geodesy import local_frame
+from scenefuse.photos.geodesy import MAX_MEDIAN_DISTANCES, local_frame
 from scenefuse.photos.photos import Photo, gps_positions, read_photos
 from scenefuse.sfm.colmap import cancellable, require_database
 from scenefuse.sfm.features import FEW_FEATURES, match_guided
@@ -270,9 +270,11 @@ def _vlad(descriptors: NDArray[np.float32], means: NDArray[np.float32]) -> NDArr
 
 
 def gps_spread_m(positions: NDArray[np.float64]) -> float:
-    """RMS horizontal distance of WGS84 positions (N, 3) from their mean, in metres."""
+    """RMS horizontal distance of WGS84 positions (N, 3) from their middle, in metres; wild ones are left out."""
     horizontal = local_frame(positions).apply(positions)[:, :2]
-    return float(np.sqrt(((horizontal - horizontal.mean(0)) ** 2).sum(1).mean()))
+    distance = np.linalg.norm(horizontal - np.median(horizontal, axis=0), axis=1)
+    near = distance[distance <= MAX_MEDIAN_DISTANCES * np.median(distance)]
+    return float(np.sqrt((near**2).mean()))
 
 
 def _automatic(

@@ -123,6 +123,12 @@ def test_strips_of_close_photos_hold_together():
     assert min(between.count((s, s + 1)) for s in range(3)) >= 40
 
 
+def test_one_wild_position_does_not_let_the_noise_of_the_others_choose_the_pairs():
+    photos = [photo(f"{k:02d}.jpg", place) for k, place in enumerate(np.random.default_rng(0).normal(0, 5, (60, 3)))]
+    wild = [photo("wild.jpg", (3000.0, 0.0, 0.0)), *photos]
+    assert chosen(photos, MatchSettings())[0] == chosen(wild, MatchSettings())[0] == "exhaustive"
+
+
 def test_positions_that_a_phone_repeats_do_not_choose_the_pairs():
     """A phone writes its last fix into dozens of photos: all distances among these are 0."""
     repeated = [photo(f"{i:03d}.jpg", (40.0 * (i // 30), 0.0, 50.0)) for i in range(120)]
