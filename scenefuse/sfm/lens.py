@@ -168,9 +168,10 @@ def _gain(poorer: Array, richer: Array) -> float:
 
 
 def _in_bounds(model: pycolmap.Reconstruction) -> bool:
-    """Whether all principal points are near enough to the middle to be a lens's."""
-    for camera in model.cameras.values():
-        off = np.array([camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2])
-        if np.abs(off).max() > MAX_OFF_CENTRE * max(camera.width, camera.height):
-            return False
-    return True
+    """Whether the principal points of most photos are near enough to the middle to be a lens's; that of a cropped photo
+    is not, and says nothing about the others'."""
+    off = []
+    for camera in (model.cameras[model.images[photo].camera_id] for photo in model.reg_image_ids()):
+        middle = np.array([camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2])
+        off.append(np.abs(middle).max() / max(camera.width, camera.height))
+    return bool(np.median(off) <= MAX_OFF_CENTRE)

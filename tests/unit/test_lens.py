@@ -65,6 +65,29 @@ def test_two_radial_terms_are_found_without_tangential_ones():
     assert camera.model_name == "RADIAL" and abs(camera.principal_point_x - 510) < 1
 
 
+def test_a_few_cropped_photos_do_not_hold_the_lens_of_the_others():
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=2, num_cameras_per_rig=1, num_frames_per_rig=10, num_points3D=300, camera_width=1000, camera_height=800
+    )
+    options.camera_model_id = pycolmap.CameraModelId.SIMPLE_RADIAL
+    options.camera_params = [700.0, 510.0, 388.0, 0.0]
+    model = pycolmap.synthesize_dataset(options)
+    pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.3), model)
+    model.cameras[1].params, model.cameras[2].params = MIDDLE, [700.0, 400.0, 400.0, 0.0]
+    model.cameras[2].width = 800  # without 200 columns on the left
+    cropped = [i for i in sorted(model.reg_image_ids()) if model.images[i].camera_id == 2]
+    for photo in cropped:
+        for point in model.images[photo].points2D:
+            point.xy = point.xy - [200.0, 0.0]
+        if photo in cropped[2:]:
+            model.deregister_frame(model.images[photo].frame_id)
+    adjust(model, HELD.freedom)
+    lens, _ = choose_lens(model)
+    camera = lens.fit(model).cameras[1]
+    assert lens == CENTRED and abs(camera.principal_point_x - 510) < 1 and abs(camera.principal_point_y - 388) < 1
+
+
 def test_a_lens_in_the_middle_without_distortion_is_held():
     lens, beyond = choose_lens(photographed([700, 700, 500, 400, 0, 0, 0, 0]))
     assert (lens, beyond) == (HELD, CENTRED)
