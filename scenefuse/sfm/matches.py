@@ -1,8 +1,8 @@
 """Which pairs of photos are compared (all of them, neighbours by GPS, or neighbours in time with loops), and their
 matching and geometric verification with COLMAP.
 
-He et al. 2026, section on the scene: ratio test 0.7, largest descriptor distance 0.7, mutual best match, guided
-re-matching.
+He et al. 2026, section on the scene: largest descriptor distance 0.7, mutual best match, guided re-matching. The ratio
+test is Lowe's (2004), 0.8, not the paper's 0.7, at which wide turns lose their links (docs/experiments.md).
 """
 
 import contextlib
@@ -64,7 +64,7 @@ class MatchSettings:
     a small set, else in sequence and by likeness."""
     exhaustive_up_to: int = 200
     """Auto compares all pairs up to this many photos."""
-    max_ratio: float = setting(0.7, above=0)
+    max_ratio: float = setting(0.8, above=0)
     """Lowe's ratio test: best over second-best descriptor distance."""
     guided_matching: bool = setting(True)
     """Match again along the epipolar lines once a pair is verified."""
