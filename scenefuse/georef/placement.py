@@ -100,15 +100,16 @@ def of_one_zero(gps: GpsCameras, least_m: float) -> tuple[GpsCameras, str]:
     known = np.flatnonzero(np.isfinite(gps.positions[:, 2]))
     if len(known) < 4 * PHOTOS_OF_ONE_ERROR:
         return gps, ""
-    steps = np.tri(len(known), k=-1)[:, PHOTOS_OF_ONE_ERROR - 1 : -PHOTOS_OF_ONE_ERROR]
+    heights, starts = gps.positions[known, 2], np.arange(PHOTOS_OF_ONE_ERROR, len(known) - PHOTOS_OF_ONE_ERROR + 1)
     explained = np.linalg.qr(np.c_[gps.centres[known], np.ones(len(known))])[0]
-    off, left = (part - explained @ (explained.T @ part) for part in (gps.positions[known, 2], steps))
-    sizes = (left.T @ off) / np.maximum((left**2).sum(0), 1e-9)
-    gains = sizes * (left.T @ off)
-    at = int(np.argmax(gains))
-    if abs(sizes[at]) <= least_m or gains[at] < off @ off / 2:
+    off = heights - explained @ (explained.T @ heights)
+    # A step, 1 from a start on, times a column is the sum of that column's end.
+    along, in_explained = (np.cumsum(part[::-1], axis=0)[::-1][starts] for part in (off, explained))
+    sizes = along / np.maximum(len(known) - starts - (in_explained**2).sum(1), 1e-9)
+    at = int(np.argmax(sizes * along))
+    if abs(sizes[at]) <= least_m or sizes[at] * along[at] < off @ off / 2:
         return gps, ""
-    late = steps[:, at] > 0
+    late = np.arange(len(known)) >= starts[at]
     few, shift = (late, -sizes[at]) if late.mean() < 0.5 else (~late, sizes[at])
     positions = gps.positions.copy()
     positions[known[few], 2] += shift
