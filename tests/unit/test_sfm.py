@@ -503,6 +503,15 @@ def test_a_photo_that_was_replaced_is_named_by_those_who_read_it(tmp_path):
         )
 
 
+def features_of(folder, calibration=None):
+    """Lists a folder's photos and finds their features."""
+    upright, photos = folder / "upright", folder / "photos.json"
+    list_photos(source=folder / "photos", upright=upright, photos=photos, settings=VideoSettings())
+    extract_features(
+        folder=upright, photos=photos, features=folder / "features.db", calibration=calibration, settings=FEATURES
+    )
+
+
 def test_a_portrait_photo_of_a_scene_has_a_portrait_camera(tmp_path):
     (tmp_path / "photos").mkdir()
     noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
@@ -510,18 +519,7 @@ def test_a_portrait_photo_of_a_scene_has_a_portrait_camera(tmp_path):
     exif[0x0112] = 6
     for index in range(3):
         Image.fromarray(noise).save(tmp_path / "photos" / f"{index}.jpg", exif=exif)
-    list_photos(
-        source=tmp_path / "photos",
-        upright=tmp_path / "upright",
-        photos=tmp_path / "photos.json",
-        settings=VideoSettings(),
-    )
-    extract_features(
-        folder=tmp_path / "upright",
-        photos=tmp_path / "photos.json",
-        features=tmp_path / "features.db",
-        settings=FEATURES,
-    )
+    features_of(tmp_path)
     with pycolmap.Database.open(tmp_path / "features.db") as database:
         assert {(c.width, c.height) for c in database.read_all_cameras()} == {(120, 160)}
 
@@ -534,20 +532,8 @@ def test_a_calibration_is_turned_along_with_photos_that_exif_rotates(tmp_path, s
         exif[0x0112] = orientation
         noise = np.random.default_rng(index).integers(0, 255, (120, 160, 3), dtype=np.uint8)
         Image.fromarray(noise).save(tmp_path / "photos" / f"{index}.jpg", exif=exif)
-    list_photos(
-        source=tmp_path / "photos",
-        upright=tmp_path / "upright",
-        photos=tmp_path / "photos.json",
-        settings=VideoSettings(),
-    )
     (tmp_path / "camera.txt").write_text("1 PINHOLE 160 120 150 151 70 52" if stored else "1 PINHOLE 120 160 9 9 50 70")
-    extract_features(
-        folder=tmp_path / "upright",
-        photos=tmp_path / "photos.json",
-        features=tmp_path / "features.db",
-        calibration=tmp_path / "camera.txt",
-        settings=FEATURES,
-    )
+    features_of(tmp_path, tmp_path / "camera.txt")
     with pycolmap.Database.open(tmp_path / "features.db") as opened:
         found = [opened.read_camera(i.camera_id) for i in sorted(opened.read_all_images(), key=lambda i: i.name)]
     # Right of the upright photo is what was its lower side: 68 of 120 rows away from where columns begin now.
@@ -562,18 +548,7 @@ def test_photos_that_exif_turns_otherwise_have_a_camera_of_their_own_unless_they
         exif[0x0112] = orientation
         noise = np.random.default_rng(index).integers(0, 255, (24, 32, 3), dtype=np.uint8)
         Image.fromarray(noise).save(tmp_path / "photos" / f"{index:02}.png", exif=exif)
-    list_photos(
-        source=tmp_path / "photos",
-        upright=tmp_path / "upright",
-        photos=tmp_path / "photos.json",
-        settings=VideoSettings(),
-    )
-    extract_features(
-        folder=tmp_path / "upright",
-        photos=tmp_path / "photos.json",
-        features=tmp_path / "features.db",
-        settings=FEATURES,
-    )
+    features_of(tmp_path)
     with pycolmap.Database.open(tmp_path / "features.db") as opened:
         cameras = {i.name: i.camera_id for i in opened.read_all_images()}
     # Three upside down have their own; one quarter turn to the right does not, beside three to the left.
@@ -622,18 +597,7 @@ def test_photos_that_show_different_things_or_nothing(tmp_path, seen, advice):
         noise = gaussian_filter(rng.uniform(0, 255, (120, 160)), 1.5)
         noise = (noise - noise.min()) / np.ptp(noise) * 140 * seen + 110 + index
         Image.fromarray(noise.astype(np.uint8)).save(tmp_path / "photos" / f"{index}.png")
-    list_photos(
-        source=tmp_path / "photos",
-        upright=tmp_path / "upright",
-        photos=tmp_path / "photos.json",
-        settings=VideoSettings(),
-    )
-    extract_features(
-        folder=tmp_path / "upright",
-        photos=tmp_path / "photos.json",
-        features=tmp_path / "features.db",
-        settings=FEATURES,
-    )
+    features_of(tmp_path)
     with pytest.raises(StageError, match=f"none of the 3 pairs of photos .*{advice}"):
         match_features(
             photos=tmp_path / "photos.json",
