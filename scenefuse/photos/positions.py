@@ -66,11 +66,11 @@ def stated_position(gps: Mapping[int, Any], xmp: bytes) -> tuple[Position, str]:
         if north is not None or east is not None:
             place, problem = degrees_of(north, north_of, east, east_of)
             if place is not None:
-                height = next((metres for metres in heights if metres is not None), None)
+                height = next(filter(None, heights), None)
                 horizontal, vertical = rtk_accuracy(xmp)
                 return Position(*place, height, horizontal or _positive(gps.get(31)), vertical), problem
             problems.append(problem)
-        heights.reverse()  # a height is best that of the position
+        heights.reverse()  # a height is best that of the position, and one of 0 is none
     return Position(), problems[0] if problems else ""
 
 
@@ -97,7 +97,7 @@ def degrees_of(north: Any, north_of: Any, east: Any, east_of: Any) -> tuple[tupl
 
 def _degrees(value: Any, reference: Any, negative: str) -> float | None:
     """Signed degrees from degrees, minutes and seconds, or as many of them as there are; None without degrees."""
-    parts, text = _parts(value), exif_text(value) if isinstance(value, str | bytes) else ""
+    parts, text = _parts(value, 360.0), exif_text(value) if isinstance(value, str | bytes) else ""
     if not parts or parts[0] is None:
         return None
     size = sum(abs(part or 0.0) / 60.0**power for power, part in enumerate(parts[:3]))
@@ -109,26 +109,27 @@ def _altitude(value: Any, reference: Any) -> float | None:
     """Metres, negative where value or reference say so; None where there are none."""
     if isinstance(reference, bytes) and reference[:1] < b"0":
         reference = tuple(reference)
-    # EXIF 3.0: 1 is below the ellipsoid, or whatever zero; 3 below the sea.
-    (altitude, *_), (code, *_) = _parts(value) or [None], _parts(reference) or [None]
+    # EXIF 3.0: 1 is below the ellipsoid, or whatever zero; 3 below the sea. No photo is taken 100 km up.
+    (altitude, *_), (code, *_) = _parts(value, 1e5) or [None], _parts(reference) or [None]
     return altitude if altitude is None or code not in (1, 3) else -abs(altitude)
 
 
-def _parts(value: Any) -> list[float | None]:
-    """The numbers of a value of EXIF or XMP, None for those that are none."""
+def _parts(value: Any, most: float = np.inf) -> list[float | None]:
+    """The numbers of a value of EXIF or XMP, None for those that are none; `most` as of `exif_number`."""
     if isinstance(value, str | bytes):
         return [
             exif_number(float(a) / float(b or 1)) if float(b or 1) else None
             for a, b in NUMBER.findall(exif_text(value))
         ]
-    return [exif_number(part) for part in (value if isinstance(value, tuple | list) else [value])]
+    return [exif_number(part, most) for part in (value if isinstance(value, tuple | list) else [value])]
 
 
-def exif_number(value: Any) -> float | None:
-    """A finite float, or None. Signed fractions that were written as EXIF's unsigned ones have wrapped numerators."""
+def exif_number(value: Any, most: float = np.inf) -> float | None:
+    """A finite float, or None. Signed fractions that were written as EXIF's unsigned ones have wrapped numerators; a
+    number up to `most` is right as it is: programs write unrounded ones with as large numerators as there are."""
     try:
-        top = int(getattr(value, "numerator", 0))
-        number = (top - 2**32) / value.denominator if 2**31 <= top < 2**32 else float(value)
+        top, number = int(getattr(value, "numerator", 0)), float(value)
+        number = (top - 2**32) / value.denominator if number > most and 2**31 <= top < 2**32 else number
     except (TypeError, ValueError, ArithmeticError, AttributeError):
         return None
     return number if np.isfinite(number) else None
@@ -150,8 +151,7 @@ def rtk_accuracy(xmp: bytes) -> tuple[float | None, float | None]:
 
 def _first(pattern: re.Pattern[bytes], xmp: bytes) -> bytes | None:
     """What XMP states first of a property, or None."""
-    found = pattern.search(xmp)
-    return None if found is None else found[1]
+    return found[1] if (found := pattern.search(xmp)) else None
 
 
 def _positive(value: Any) -> float | None:

@@ -349,6 +349,8 @@ NONE = R(0, 0)
         ({1: "S", 2: (R(-33), R(-30), R(0)), 3: "E", 4: (R(70), R(15), R(0))}, (-33.5, 70.25), ""),
         ({2: (R(-33), R(30), R(0)), 3: "E", 4: (R(70), R(15), R(0))}, (-33.5, 70.25), ""),
         ({2: (R(2**32 - 33), R(30), R(0)), 3: "E", 4: (R(70), R(15), R(0))}, (-33.5, 70.25), ""),
+        ({2: (R(2**32 - 335 * 10**6, 10**7),), 3: "E", 4: (R(70), R(15), R(0))}, (-33.5, 70.25), ""),
+        ({1: "N", 2: (R(33), R(30), R(0)), 3: "E", 4: (R(70), R(14), R(3 * 10**9, 5 * 10**7))}, (33.5, 70.25), ""),
         ({1: "s", 2: (33.5,), 3: "west", 4: 70.25}, (-33.5, -70.25), ""),
         ({1: b"S\0", 2: (R(33), R(30)), 3: b"W\0", 4: (R(70), R(15))}, (-33.5, -70.25), ""),
         ({1: "N", 2: (R(33), R(30), NONE), 3: "E", 4: (R(70), R(15), R(1, 0))}, (33.5, 70.25), ""),
@@ -384,6 +386,7 @@ def test_a_position_is_read_however_exif_writes_it(gps, place, note):
         (R(-400), 1, -400),
         (R(-400), 0, -400),
         (R(2**32 - 400), None, -400),
+        (R(4 * 10**9, 10**7), 0, 400),
         (R(400), b"\2", 400),
         (R(400), b"\3", -400),
         (R(400), None, 400),
@@ -412,9 +415,20 @@ def test_where_exif_has_no_position_xmp_has(xmp):
             70.25,
             -12.5,
         ) and not note
-    own = {1: "N", 2: (40.0,), 3: "W", 4: (3.0,)}
-    position, _ = stated_position(own, xmp)
-    assert (position.latitude_deg, position.longitude_deg, position.altitude_m) == (40.0, -3.0, -12.5)
+    for height in ({}, {6: R(0)}):
+        position, _ = stated_position({1: "N", 2: (40.0,), 3: "W", 4: (3.0,)} | height, xmp)
+        assert (position.latitude_deg, position.longitude_deg, position.altitude_m) == (40.0, -3.0, -12.5)
+
+
+def test_unrounded_numbers_that_pillow_writes_into_exif_are_read_as_they_are(tmp_path):
+    place, exif = (50.120456, 8.731987, 147.4228664), Image.Exif()
+    sexagesimal = [(v // 1, v * 60 // 1 % 60, v * 3600 % 60) for v in place[:2]]
+    exif[0x8825] = {1: "N", 2: sexagesimal[0], 3: "E", 4: sexagesimal[1], 5: b"\0", 6: place[2]}
+    exif[0x8769] = {0x920A: 8.7654321012}
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.jpg", exif=exif)
+    photo = inspect_photo(tmp_path, "a.jpg")
+    assert (photo.latitude_deg, photo.longitude_deg, photo.altitude_m) == pytest.approx(place, rel=1e-9)
+    assert photo.focal_mm == pytest.approx(8.7654321012)
 
 
 def test_why_a_photo_has_no_position_is_said(tmp_path):
