@@ -14,6 +14,7 @@ from scenefuse.core.stage import atomic_directory, read_json, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.photos.geodesy import GridFrame, LocalFrame, scene_frame
 from scenefuse.photos.workspace import View, write_model
+from scenefuse.surface.gltf import map_about
 from scenefuse.surface.make_surface import SurfaceInputs, placed_views
 
 # Cameras of OpenGL and nerfstudio look along -z, with y up.
@@ -76,9 +77,9 @@ def _metashape(views: list[View], frame: LocalFrame | GridFrame | None) -> ET.El
             ET.SubElement(calibration, name).text = repr(float(number_px))
         camera = ET.SubElement(cameras, "camera", id=key, sensor_id=key, label=label, enabled="true")
         ET.SubElement(camera, "transform").text = _numbers(view.world_from_cam)
-    if frame is not None and frame.crs is not None and has_place(frame.crs):
+    if views and frame is not None and frame.crs is not None and has_place(frame.crs):
         crs = pyproj.CRS.from_user_input(frame.crs)
-        earth = _earth_from_scene(frame, crs)
+        earth = _earth_from_scene(frame, crs, np.mean([view.centre for view in views], axis=0))
         scale = float(np.cbrt(np.linalg.det(earth[:3, :3])))
         transform = ET.SubElement(chunk, "transform")
         ET.SubElement(transform, "rotation").text = _numbers(earth[:3, :3] / scale)
@@ -89,21 +90,16 @@ def _metashape(views: list[View], frame: LocalFrame | GridFrame | None) -> ET.El
     return document
 
 
-def _earth_from_scene(frame: LocalFrame | GridFrame, crs: pyproj.CRS) -> Array:
+def _earth_from_scene(frame: LocalFrame | GridFrame, crs: pyproj.CRS, about: Array) -> Array:
     """(4, 4) from a scene's frame in a CRS to Earth-centred coordinates (m) on that CRS's own datum, which Metashape
-    takes them to be on; right at the scene's origin."""
+    takes them to be on; right at a place (3,) of the scene."""
     grid = plane(crs).source_crs if plane(crs).is_bound else plane(crs)
     assert grid is not None and grid.geodetic_crs is not None
     axes = pyproj.CRS.from_epsg(4978).to_json_dict()["coordinate_system"]
     datum = grid.geodetic_crs.to_json_dict() | {"type": "GeodeticCRS", "coordinate_system": axes}
     datum.pop("id", None)
     to_earth = pyproj.Transformer.from_crs(grid.to_3d(), pyproj.CRS.from_json_dict(datum), always_xy=True)
-    step = 100.0
-    corners = frame.in_crs(step * np.vstack([np.zeros(3), np.eye(3)])) * [1, 1, unit_m(crs)]
-    origin, *ends = np.column_stack(to_earth.transform(*corners.T))
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = (np.array(ends) - origin).T / step, origin
-    return matrix
+    return map_about(about, lambda points: to_earth.transform(*(frame.in_crs(points) * [1, 1, unit_m(crs)]).T))
 
 
 def _numbers(values: Array) -> str:

@@ -6,6 +6,7 @@ Sources: glTF 2.0 (Khronos), EXT_mesh_features (Cesium), KHR_materials_unlit (ph
 import io
 import json
 import struct
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -269,18 +270,23 @@ def place_of_scene(georeference_json: Path | None) -> dict[str, Any]:
     return content | {name: value(known, name) for name in names if name in known}
 
 
-def earth_from_scene(georeference_json: Path | None) -> Array | None:
-    """(4, 4) from a scene's frame to Earth-centred coordinates (EPSG:4978, m), right at its origin; None without place.
+def earth_from_scene(georeference_json: Path | None, about: Array) -> Array | None:
+    """(4, 4) from a scene's frame to Earth-centred coordinates (EPSG:4978, m), right at a place (3,) of the scene; None
+    without place.
 
     Heights are taken as those above the ellipsoid.
     """
     frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
     if frame is None or not has_place(frame.crs):
         return None
-    step = 100.0
-    latitude, longitude, height = frame.inverse(step * np.vstack([np.zeros(3), np.eye(3)])).T
-    geocentric = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
-    origin, *ends = np.column_stack(geocentric.transform(longitude, latitude, height))
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = (np.array(ends) - origin).T / step, origin
+    to_earth = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978")
+    return map_about(about, lambda points: to_earth.transform(*frame.inverse(points).T))
+
+
+def map_about(about: Array, to_earth: Callable[[Array], Sequence[Array]]) -> Array:
+    """(4, 4) of a map of points (N, 3) to their x, y, z on Earth, right at a place (3,): elsewhere it is bent."""
+    step, matrix = 100.0, np.eye(4)
+    origin, *ends = np.column_stack(to_earth(about + step * np.vstack([np.zeros(3), np.eye(3)])))
+    matrix[:3, :3] = (np.array(ends) - origin).T / step
+    matrix[:3, 3] = origin - matrix[:3, :3] @ about
     return matrix

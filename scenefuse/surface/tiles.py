@@ -45,7 +45,8 @@ def make_tiles(*, cloud: Path, objects: list[Path], georeference_json: Path | No
     points, metres = read_cloud(cloud), metres_per_unit(length_unit(georeference_json))
     if not len(points):
         raise StageError(f"{cloud} holds no points; there is nothing to make tiles of")
-    place, extras = earth_from_scene(georeference_json), place_of_scene(georeference_json)
+    place = earth_from_scene(georeference_json, points.points.mean(0))
+    extras = place_of_scene(georeference_json)
     if place is not None:
         place[:3, :3] /= metres
     points = replace(points, points=metres * points.points)

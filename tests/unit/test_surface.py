@@ -455,7 +455,7 @@ def test_a_drawing_from_above_lies_in_the_crs_of_its_scene(placed):
 def test_a_site_s_own_system_has_no_place_on_earth(tmp_path):
     site = 'LOCAL_CS["site",UNIT["metre",1],AXIS["X",EAST],AXIS["Y",NORTH]]'
     write_json(tmp_path / "g.json", GEOREFERENCE | {"crs": quantity(site, "")})
-    assert earth_from_scene(tmp_path / "g.json") is None
+    assert earth_from_scene(tmp_path / "g.json", np.zeros(3)) is None
 
 
 @pytest.mark.slow
@@ -573,6 +573,26 @@ def test_tiles_hold_every_point_once_and_lie_where_the_scene_lies(closed, tmp_pa
     assert np.allclose(every[np.lexsort(every.T)], points[np.lexsort(points.astype(np.float32).T)], atol=1e-5)
     counts = [len(part) for uri, part in found if uri.startswith("ball")]
     assert len(counts) == 2 and 1000 < counts[0] < 10_000 and counts[1] >= len(closed.vertices)
+
+
+def test_tiles_and_cameras_kilometres_from_the_origin_of_their_scene_lie_where_the_crs_says(tmp_path: Path):
+    """As in a given cloud of 1.2 km, whose origin is a round place."""
+    far, folder = np.array([-5000.0, -5000, 400]), tmp_path / "scenes/yard"
+    write_cloud(tmp_path / "completed.ply", Cloud(far + np.eye(3)))
+    write_json(tmp_path / "g.json", GEOREFERENCE | {"origin_in_crs": quantity([46e4, 521e4, 0.0], "m")})
+    here = {"georeference_json": tmp_path / "g.json"}
+    tiles.make_tiles(cloud=tmp_path / "completed.ply", objects=[], folder=folder / "tiles", **here)
+    earth = np.array(read_json(folder / "tiles/points/tileset.json")["root"]["transform"]).reshape(4, 4).T
+    found = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*(earth @ [*far, 1])[:3])
+    there = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:25832", always_xy=True).transform(*found[:2])
+    assert [*there, found[2]] == pytest.approx([455e3, 5205e3, 400], abs=0.01)
+    (folder / "undistorted/sparse").mkdir(parents=True)
+    moved = Sim3(1.0, np.eye(3), -far).matrix
+    views = [replace(view, cam_from_world=view.cam_from_world @ moved) for view in from_above(3)]
+    write_model(folder / "undistorted/sparse", views)
+    export_cameras(scene_workspace=folder / "undistorted", objects=[], folder=folder / "cameras", **here)
+    place = metashape_place(folder / "cameras/cameras.xml")
+    assert place.in_crs(far[None])[0] == pytest.approx([455e3, 5205e3, 400], abs=0.01)
 
 
 def write_tables(scenes: list[str], objects: list[str]) -> None:
