@@ -22,10 +22,12 @@ OWN_SETTINGS = Path("config/config.yaml")
 # More values than any settings file has; messages about fewer are still short.
 MAX_VALUES = 10_000
 T = TypeVar("T")
-# A JSON schema's validator to which NaN, infinity and what exceeds a float are no numbers.
-_TYPES = jsonschema.Draft202012Validator.TYPE_CHECKER.redefine(
+# A JSON schema's validator to which NaN, infinity and what exceeds a float are no numbers; nor is 3.0 an integer, for
+# command lines do not take it.
+_NUMBERS = jsonschema.Draft202012Validator.TYPE_CHECKER.redefine(
     "number", lambda _, value: type(value) in (int, float) and abs(value) <= sys.float_info.max
 )
+_TYPES = _NUMBERS.redefine("integer", lambda _, value: type(value) is int)
 _Validator = jsonschema.validators.extend(jsonschema.Draft202012Validator, type_checker=_TYPES)
 
 

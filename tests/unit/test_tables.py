@@ -229,6 +229,7 @@ def test_the_variant_that_is_fused_comes_first_in_whatever_order_they_are_writte
             {"fusion": {"mode": "fil"}},
             r"config, fusion.mode: 'fil' is not one of \['evidence', 'fill', 'append', 'replace'\]",
         ),
+        ({"object": {"frames": {"max_frames": 60.0}}}, "object.frames.max_frames: 60.0 is not of type 'integer'"),
         ({"gpu": "many"}, "config, gpu: 'many' does not match"),
         ({"registration": {"variants": ["full", "no_crops"]}}, "unknown variant 'no_crops'.*defines: full, paper"),
         ({"registration": {"variants": ["paper"]}}, "'full' is missing; it is the one that is fused"),
