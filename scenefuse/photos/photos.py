@@ -123,7 +123,9 @@ def has_16_bits(path: Path) -> bool:
 
 
 def _pixels(image: Image.Image, path: Path) -> NDArray[Any]:
-    """(H, W) or (H, W, 3) RGB pixels of a picture, opened by Pillow, as stored: of 8 or 16 bits."""
+    """(H, W) or (H, W, 3) RGB pixels of a picture, opened by Pillow, as stored, or of a TIFF, which forgets how it is
+    turned, as people see them: of 8 or 16 bits."""
+    image.load()
     if image.mode.startswith("I;16"):
         return np.asarray(image)
     if has_16_bits(path):

@@ -128,7 +128,8 @@ def _read(path: Path, flags: int) -> NDArray[Any]:
     if not Path(path).is_file():
         raise StageError(f"{path} does not exist; rerun the stage that writes it")
     stored_size(path)
-    pixels = cv2.imread(str(path), flags)
+    # By name OpenCV reads no TIFF that lies on its side.
+    pixels = cv2.imdecode(np.fromfile(path, np.uint8), flags)
     if pixels is None:
         raise StageError(f"{path} is no readable picture; rerun the stage that writes it")
     return pixels

@@ -156,8 +156,7 @@ def _first(pattern: re.Pattern[bytes], xmp: bytes) -> bytes | None:
 
 def _positive(value: Any) -> float | None:
     """A positive number of EXIF or XMP, or None."""
-    number = next(iter(_parts(value)), None)
-    return number if number is not None and number > 0 else None
+    return next((number for number in _parts(value)[:1] if number is not None and number > 0), None)
 
 
 def read_geo(path: Path) -> dict[str, Position]:

@@ -458,6 +458,21 @@ def test_photos_of_12_bits_and_dark_ones_are_stretched_and_that_is_said(tmp_path
     check_unchanged(tmp_path / "upright", photos)
 
 
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_a_tiff_of_12_bits_in_16_is_turned_once(tmp_path, orientation):
+    pixels = np.random.default_rng(0).integers(50, 4096, (3, 5, 3)).astype("<u2").repeat(8, 0).repeat(8, 1)
+    height, width, at = *pixels.shape[:2], 8 + pixels.nbytes
+    tags = [(256, 3, 1, width), (257, 3, 1, height), (258, 3, 3, at), (259, 3, 1, 1), (262, 3, 1, 2), (273, 4, 1, 8)]
+    tags += [(274, 3, 1, orientation), (277, 3, 1, 3), (278, 3, 1, height), (279, 4, 1, pixels.nbytes)]
+    end = struct.pack("<4H", 16, 16, 16, len(tags)) + b"".join(struct.pack("<HHII", *tag) for tag in tags) + bytes(4)
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p/a.tif").write_bytes(b"II*\0" + struct.pack("<I", at + 6) + pixels.tobytes() + end)
+    (photo,) = listed(tmp_path, tmp_path / "p")
+    seen = np.rot90(pixels, {1: 0, 3: 2, 6: -1}[orientation]) / 16
+    assert (photo.height, photo.width) == seen.shape[:2]
+    assert np.abs(read_rgb(tmp_path / "upright/a.tif") - seen).max() <= 1
+
+
 def test_a_photo_whose_exif_is_odd_keeps_its_place_when_it_is_turned(tmp_path):
     exif = Image.Exif()
     exif[0x0112], exif[0x8769] = 6, {0xA405: 24}
