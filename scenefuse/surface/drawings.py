@@ -186,8 +186,7 @@ def draw_surface(
     # Of the CRS in one of the scene, which counts in metres where its CRS may in feet.
     per_unit = 1.0 if frame is None else float(np.ptp(frame.in_crs(UP * np.arange(2)[:, None])[:, 2]))
     has_north = frame is not None and frame.has_north
-    with atomic_directory(folder) as output:
-        pages = PdfPages(output / "drawings.pdf", metadata={"CreationDate": None})
+    with atomic_directory(folder) as output, PdfPages(output / "drawings.pdf", metadata={"CreationDate": None}) as pdf:
         for side, axes in _axes_of(whole, turn, facade).items() if len(whole.faces) else ():
             drawn, shown, crs, shift, counted, ratio = whole, painted, None, np.zeros(3), unit, 1.0
             if side != "above":
@@ -219,11 +218,10 @@ def draw_surface(
             corner = (left, drawing.top + shift[1])
             figure = _sheet(drawing, title, counted, metres / ratio / scale, corner, crs)
             figure.savefig(output / f"{side}.png", dpi=200)
-            pages.savefig(figure)
+            pdf.savefig(figure)
             report[f"{side}_pixel"], report[f"{side}_scale"] = quantity(drawing.pixel, counted), quantity(scale, "1")
         if not len(whole.faces):
-            pages.savefig(Figure(figsize=(1, 1)))
-        pages.close()
+            pdf.savefig(Figure(figsize=(1, 1)))
         report |= {"wall_turn": quantity(float(np.degrees(turn)), "deg"), "crs": quantity(frame and frame.crs, "")}
         report["has_north"] = quantity(has_north, "")
         write_json(output / "drawings.json", report)

@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, within
+from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, voxels, within
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import MARGIN, MIN_AGREEING, SAME_PLACE_SPACINGS
@@ -147,7 +147,12 @@ def oriented(cloud: Cloud, views: list[View]) -> Cloud:
         return cloud
     points = _open3d_cloud(cloud, cloud.points.mean(0))
     points.orient_normals_consistent_tangent_plane(NEIGHBOURS)
-    return replace(cloud, normals=np.asarray(points.normals).astype(np.float32))
+    normals = np.asarray(points.normals).astype(np.float32)
+    # Open3D turns all of them inwards or outwards: what is highest in a place faces up.
+    falling = np.argsort(-cloud.points[:, 2])
+    place = voxels(cloud.points[falling] * [1, 1, 0], MARGIN * cloud.diagonal)[0]
+    highest = falling[np.unique(place, return_index=True)[1]]
+    return replace(cloud, normals=-normals if normals[highest, 2].sum() < 0 else normals)
 
 
 def _open3d_cloud(cloud: Cloud, middle: Array):  # type: ignore[no-untyped-def]

@@ -111,6 +111,17 @@ def test_a_wide_gap_stays_open_and_its_area_is_said():
     assert 0.5 < surface.open_area / (np.pi * 0.4**2) < 1.2
 
 
+def test_a_cloud_without_normals_and_photos_has_a_surface_that_faces_outwards():
+    dome, ground = sphere(0.15).points, np.random.default_rng(0).normal(0, [2, 2, 0.01], (1500, 3))
+    ground = ground[np.linalg.norm(ground, axis=1) > 1]
+    surface = make_mesh(Cloud(np.concatenate([dome[dome[:, 2] > 0], ground])), [])
+    a, b, c = (surface.vertices.points[surface.faces[:, k]] for k in range(3))
+    normals, middle = np.cross(b - a, c - a), (a + b + c) / 3
+    of_dome = middle[:, 2] > 0.2
+    assert of_dome.sum() > 100 and ((normals * middle).sum(1)[of_dome] > 0).mean() > 0.9
+    assert (normals[~of_dome, 2] > 0).mean() > 0.9
+
+
 def test_what_no_photo_confirms_is_told_apart(closed):
     height = closed.vertices.points[closed.faces].mean(1)[:, 2]
     assert (closed.classes[height < -2 * STEP] == FaceClass.UNCONFIRMED).all()
