@@ -236,7 +236,9 @@ def _from_video(
     for _, window in groupby(scored, lambda one: window_of[one[1]]):
         origin |= _write_frame(output, *max(window, key=lambda one: one[0]), max_width_px)
     listed = [inspect_photo(output, name) for name in sorted(origin)]
-    notes, beside = photo_notes(listed, 0), subtitles(source)
+    notes, beside, count = photo_notes(listed, 0), subtitles(source), video_size(source)[0]
+    if count > len(seconds):
+        notes.append(f"the video says that it has {count} frames, {len(seconds)} can be decoded: it may be cut short")
     if beside is not None:
         at = [seconds[origin[photo.name]["frame"]] for photo in listed]
         positions, note = positions_in_subtitles(beside, at)

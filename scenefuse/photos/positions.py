@@ -87,11 +87,8 @@ def degrees_of(north: Any, north_of: Any, east: Any, east_of: Any) -> tuple[tupl
         return None, f"{latitude:g}, {longitude:g} degrees lie nowhere on earth"
     if (latitude, longitude) == (0.0, 0.0):
         return None, "0, 0 degrees are what a receiver without a fix writes"
-    unsure = [
-        word
-        for value, of, word in ((latitude, north_of, "north"), (longitude, east_of, "east"))
-        if value > 0 and of == ""
-    ]
+    sides = (latitude, north_of, "north"), (longitude, east_of, "east")
+    unsure = [word for degrees, of, word in sides if degrees > 0 and of == ""]
     return (latitude, longitude), f"its hemisphere is not stated, {' and '.join(unsure)} is assumed" if unsure else ""
 
 

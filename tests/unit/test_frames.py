@@ -176,6 +176,15 @@ def test_a_video_that_was_filmed_upright_is_stood_upright(tmp_path):
     assert {(photo.width, photo.height) for photo in listed(tmp_path, path)[0]} == {(96, 128)}
 
 
+def test_a_video_that_is_cut_short_is_said_to_be(tmp_path):
+    path = film(tmp_path / "orbit.avi")
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 6 // 10])
+    photos, said = listed(tmp_path, path)
+    assert 3 <= len(photos) < 12
+    assert f"has 12 frames, {len(photos)} can be decoded: it may be cut" in " ".join(value(said, "notes"))
+
+
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_video_that_is_a_panorama_is_refused(tmp_path, version):
     content = film(tmp_path / "insta.mp4").read_bytes()
