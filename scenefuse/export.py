@@ -140,12 +140,7 @@ def write_zip(page: Path, exported: Iterable[Path], file: Path) -> None:
     """
     results, text = page.parent.parent, page.read_text(encoding="utf-8")
     given = {*exported, *(results / link for link in re.findall(r'href="\.\./([^"#]+)"', text))}
-    files = {
-        path
-        for top in given
-        for path in ([top] if top.is_file() else top.rglob("*"))
-        if path.is_file() and path.name[0] != "."
-    }
+    files = {path for top in given for path in (top, *top.rglob("*")) if path.is_file() and path.name[0] != "."}
     with atomic_file(file) as temporary, ZipFile(temporary, "w", ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr(page.name, text.replace('href="../', 'href="').replace(">results/", ">"))
         for path in sorted(files):

@@ -153,7 +153,7 @@ def surface_facts(folder: Path, row: Row) -> dict[str, str]:
         mesh += f"; {length(bridged, found['bridged_area']['unit'].replace('2', '²'))} of it {WORDS['bridged']}"
     if not is_current(folder / "drawings/drawings.pdf", folder / "surface.json"):
         return {"Mesh": mesh}
-    above = f"; above.tif beside it, for QGIS, is in {has['crs']}" if "crs" in has else ""
+    above = f"; above.tif beside it, for QGIS, is in {crs_name(has['crs'])}" if "crs" in has else ""
     return {"Mesh": mesh, "Drawings": f"{place}/drawings/drawings.pdf, to scale{above}"}
 
 

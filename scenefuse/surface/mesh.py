@@ -93,6 +93,8 @@ def make_mesh(cloud: Cloud, views: list[View], photos: Photos | None = None) -> 
         StageError: the points lie in a line or in one place, or are too few to have a surface.
     """
     notes = []
+    # As in a scan that was merged twice.
+    cloud = cloud[np.sort(np.unique(cloud.points, axis=0, return_index=True)[1])]
     step, count = spacing(cloud.points), len(cloud)
     if count <= NEIGHBOURS or step == 0 or np.linalg.matrix_rank(cloud.points - cloud.points.mean(0), step) < 2:
         raise StageError(f"{count} points have no surface; at least {NEIGHBOURS + 1} that lie in no line are needed")

@@ -122,6 +122,12 @@ def test_a_cloud_without_normals_and_photos_has_a_surface_that_faces_outwards():
     assert (normals[~of_dome, 2] > 0).mean() > 0.9
 
 
+def test_a_cloud_that_holds_every_point_twice_has_the_surface_of_once():
+    once = sphere(0.15)
+    areas = [make_mesh(cloud, []).areas().sum() for cloud in (once, once[np.tile(np.arange(len(once)), 2)])]
+    assert areas == pytest.approx([4 * np.pi] * 2, rel=0.05)
+
+
 def test_what_no_photo_confirms_is_told_apart(closed):
     height = closed.vertices.points[closed.faces].mean(1)[:, 2]
     assert (closed.classes[height < -2 * STEP] == FaceClass.UNCONFIRMED).all()
@@ -775,6 +781,8 @@ def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_int
     for age, listed in ((10, False), (-10, True)):
         os.utime(pdf, (made - age, made - age))
         assert ("Drawings" in surface_facts(tmp_path, {})) == listed
+    named = surface_facts(tmp_path, {"crs": pyproj.CRS("EPSG:25832+7837").to_wkt("WKT1_GDAL")})["Drawings"]
+    assert named.endswith("above.tif beside it, for QGIS, is in ETRS89 / UTM zone 32N + DHHN2016 height")
 
 
 def test_paper_begins_with_an_overview_and_gives_an_object_two_pages_with_its_sides_to_scale(drawings, tmp_path: Path):
