@@ -190,7 +190,8 @@ def _other_copies(folder: Path, names: list[str]) -> dict[str, str]:
             with suppress(StageError), open_picture(folder / name) as image:
                 exif = image.getexif()
                 taken = exif.get_ifd(IFD.Exif)
-                if when := taken.get(Base.DateTimeOriginal):
+                # A clock that was not set writes blanks or zeros.
+                if (when := str(taken.get(Base.DateTimeOriginal) or "")).strip("0: \0"):
                     own = exif.get(Base.Model), taken.get(Base.BodySerialNumber, "")
                     shot = tuple(map(str, (when, taken.get(Base.SubsecTimeOriginal), *own)))
                     pixels[name] = image.width * image.height, shot

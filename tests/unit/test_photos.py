@@ -120,10 +120,14 @@ def test_smaller_and_edited_copies_of_a_shot_are_left_out_and_photos_of_a_rig_st
     shot("p/right/2.jpg", (40, 30))
     shot("p/later/1.jpg", (20, 15), "2026:05:01 12:00:09")
     shot("p/undated/1.jpg", (20, 15), "")
+    for number, when in ((4, "0000:00:00 00:00:00"), (5, "    :  :     :  :  ")):
+        for name in (f"p/{number}.jpg", f"p/later/{number}.jpg"):
+            shot(name, (40, 30), when, "A7")
     for name, serial in (("left/3.jpg", "A7"), ("left/edited/3.jpg", "A7"), ("right/3.jpg", "B2")):
         shot(f"p/{name}", (40, 30), serial=serial)
     names = [photo.name for photo in listed(tmp_path, tmp_path / "p")]
-    assert " ".join(names) == "1.JPG later/1.jpg left/2.jpg left/3.jpg right/2.jpg right/3.jpg undated/1.jpg"
+    there = "1.JPG 4.jpg 5.jpg later/1.jpg later/4.jpg later/5.jpg left/2.jpg left/3.jpg right/2.jpg right/3.jpg"
+    assert " ".join(names) == f"{there} undated/1.jpg"
     notes = value(read_json(tmp_path / "photos.json"), "notes")
     assert "2 photos are other copies of the same shots" in notes[0] and "(left/edited/3.jpg of left/3.jpg)" in notes[0]
 
