@@ -123,9 +123,8 @@ def has_16_bits(path: Path) -> bool:
 
 
 def _pixels(image: Image.Image, path: Path) -> NDArray[Any]:
-    """(H, W) or (H, W, 3) RGB pixels of a picture, opened by Pillow, as stored, or of a TIFF, which forgets how it is
-    turned, as people see them: of 8 or 16 bits."""
-    image.load()
+    """(H, W) or (H, W, 3) RGB pixels of a picture, opened by Pillow, of 8 or 16 bits: as stored, or as people see them
+    where the picture forgets then how it is turned."""
     if image.mode.startswith("I;16"):
         return np.asarray(image)
     if has_16_bits(path):

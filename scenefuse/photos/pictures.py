@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
-from scenefuse.photos.photo_files import JPEG, stored_size
+from scenefuse.photos.photo_files import JPEG, open_picture
 
 # Grey levels (one standard deviation) that a photo's pixels are off at least.
 NOISE = 1.5
@@ -127,12 +127,15 @@ def write_picture(path: Path, pixels: NDArray[np.uint8]) -> None:
 def _read(path: Path, flags: int) -> NDArray[Any]:
     if not Path(path).is_file():
         raise StageError(f"{path} does not exist; rerun the stage that writes it")
-    stored_size(path)
-    # By name OpenCV reads no TIFF that lies on its side.
+    with open_picture(path) as image:
+        kind, orientation = image.format, image.getexif().get(0x0112)
+    turned = orientation - 1 if kind == "TIFF" and orientation in range(1, 9) else 0
+    # By name OpenCV reads no TIFF that lies on its side; all others it stands upright, whatever is asked.
     pixels = cv2.imdecode(np.fromfile(path, np.uint8), flags)
     if pixels is None:
         raise StageError(f"{path} is no readable picture; rerun the stage that writes it")
-    return pixels
+    pixels = pixels[:: -1 if turned % 4 > 1 else 1, :: -1 if turned % 4 in (1, 2) else 1]
+    return np.ascontiguousarray(pixels.swapaxes(0, 1) if turned > 3 else pixels)
 
 
 def write_depth(path: Path, depth: NDArray[np.float32]) -> None:

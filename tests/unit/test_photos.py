@@ -471,6 +471,7 @@ def test_a_tiff_of_12_bits_in_16_is_turned_once(tmp_path, orientation):
     end = struct.pack("<4H", 16, 16, 16, len(tags)) + b"".join(struct.pack("<HHII", *tag) for tag in tags) + bytes(4)
     (tmp_path / "p").mkdir()
     (tmp_path / "p/a.tif").write_bytes(b"II*\0" + struct.pack("<I", at + 6) + pixels.tobytes() + end)
+    assert np.array_equal(read_raw(tmp_path / "p/a.tif")[..., ::-1], pixels)  # as stored
     (photo,) = listed(tmp_path, tmp_path / "p")
     seen = np.rot90(pixels, {1: 0, 3: 2, 6: -1}[orientation]) / 16
     assert (photo.height, photo.width) == seen.shape[:2]
