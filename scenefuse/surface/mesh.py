@@ -147,7 +147,9 @@ def oriented(cloud: Cloud, views: list[View]) -> Cloud:
     cloud = with_normals(cloud, views)
     if views:
         return cloud
-    points = _open3d_cloud(cloud, cloud.points.mean(0))
+    # Of points on a lattice or in one plane, the triangulation takes the square of their number in time, or fails.
+    shaken = cloud.points + np.random.default_rng(0).normal(0, 1e-6 * cloud.diagonal, cloud.points.shape)
+    points = _open3d_cloud(replace(cloud, points=shaken), cloud.points.mean(0))
     points.orient_normals_consistent_tangent_plane(NEIGHBOURS)
     normals = np.asarray(points.normals).astype(np.float32)
     # Open3D turns all of them inwards or outwards: what is highest in a place faces up.

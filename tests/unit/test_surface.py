@@ -122,6 +122,12 @@ def test_a_cloud_without_normals_and_photos_has_a_surface_that_faces_outwards():
     assert (normals[~of_dome, 2] > 0).mean() > 0.9
 
 
+def test_a_lattice_of_points_in_one_plane_has_a_surface():
+    surface = make_mesh(Cloud(plane(0.2, 0.1).points), [])
+    normals = np.cross(*np.diff(surface.vertices.points[surface.faces], axis=1).swapaxes(0, 1))
+    assert surface.areas().sum() == pytest.approx(4, rel=0.2) and (normals[:, 2] > 0).all()
+
+
 def test_a_cloud_that_holds_every_point_twice_has_the_surface_of_once():
     once = sphere(0.15)
     areas = [make_mesh(cloud, []).areas().sum() for cloud in (once, once[np.tile(np.arange(len(once)), 2)])]
