@@ -266,7 +266,6 @@ def video_size(source: Path) -> tuple[int, int, int]:
     video = cv2.VideoCapture(str(source))
     kinds = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
     count, width, height = (int(video.get(kind)) for kind in kinds)
-    video.release()
     return count, width, height
 
 

@@ -75,8 +75,7 @@ def exports(folder: Path) -> list[Path]:
     """Metashape's XML and Bundler's files in a folder."""
     begin = {".xml": b"<chunk", BUNDLER: b"# Bundle"}
     files = sorted(folder.iterdir()) if folder.is_dir() else []
-    marks = [(file, begin.get(file.suffix.lower())) for file in files if file.is_file()]
-    return [file for file, mark in marks if mark and mark in head(file)]
+    return [file for file in files if (mark := begin.get(file.suffix.lower())) and mark in head(file)]
 
 
 def head(file: Path) -> bytes:
@@ -416,7 +415,12 @@ def thin_out(count: int, step: int, limit: int) -> list[int]:
 
 
 def _files_below(folder: Path) -> list[Path]:
-    """All files that are not hidden; a link to a folder that was already entered is not followed again."""
+    """All files that are not hidden; a link to a folder that was already entered is not followed again.
+
+    Raises:
+        StageError: a picture, or what may be a folder, is a link to nothing: git-annex has not fetched it, or a disk is
+            not there.
+    """
     files, entered = [], set()
     for place, folders, names in os.walk(folder, followlinks=True):
         real = os.path.realpath(place)
@@ -426,4 +430,7 @@ def _files_below(folder: Path) -> list[Path]:
         entered.add(real)
         folders[:] = sorted(f for f in folders if not f.startswith(".") and f.casefold() not in SYSTEM_FOLDERS)
         files += [Path(place, name) for name in names if not name.startswith(".")]
+    lost = next((file for file in files if file.suffix.lower() in (*SUFFIXES, "") and not file.exists()), None)
+    if lost is not None:
+        raise StageError(f"{lost} is a link to what is not there; fetch that, or remove the link")
     return [file for file in files if file.is_file()]

@@ -294,6 +294,16 @@ def test_photos_in_symlinked_folders_are_found_once(tmp_path):
     assert photo_files(tmp_path / "p") == [tmp_path / "p" / "flight" / "a.jpg"]
 
 
+@pytest.mark.parametrize("name", ["b.JPG", "flight"])
+def test_links_to_photos_that_are_not_there_are_named(tmp_path, name):
+    save(tmp_path / "p/a.jpg")
+    (tmp_path / "p/notes.txt").symlink_to(tmp_path / "gone.txt")
+    assert len(photo_files(tmp_path / "p")) == 1
+    (tmp_path / "p" / name).symlink_to(tmp_path / "disk" / name)
+    with pytest.raises(StageError, match=f"{name} is a link to what is not there; fetch that, or remove the link"):
+        photo_files(tmp_path / "p")
+
+
 @pytest.mark.parametrize("ending", ["jpe", "JFIF", "ppm"])
 def test_photos_in_less_common_formats_are_read_by_all_who_read_photos(tmp_path, ending):
     name = f"a.{ending}"
