@@ -5,6 +5,8 @@ As COLMAP's (Schoenberger, Frahm 2016), with the same tests; descriptors are com
 place of all with all, which takes a tenth of the time.
 """
 
+import contextlib
+import sqlite3
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -80,23 +82,30 @@ def extract_features(
     options.max_image_size = settings.max_image_size_px
     recipe = settings, photos.read_text(), calibration and calibration.read_text()
     with resumed_file(features, *recipe) as temporary:
-        with pycolmap.Database.open(temporary) as opened:
-            camera_of_done = {image.name: image.camera_id for image in opened.read_all_images()}
-        for names in groups:
-            first = next(p for p in listed if p.name == names[0])
-            lens = None if known is None else turned(known, quarters[first.name], first.name)
-            reader = _reader_options(settings, lens, first)
-            reader.existing_camera_id = next((camera_of_done[n] for n in names if n in camera_of_done), -1)
-            cancellable(
-                pycolmap.extract_features,
-                temporary,
-                folder,
-                image_names=names,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=options,
-                device=pycolmap.Device.cpu,
-            )
+        # Photos that do not get all the features they may have are searched again, for ones of less contrast.
+        for peak in (options.sift.peak_threshold, options.sift.peak_threshold / 3):
+            options.sift.peak_threshold = peak
+            with pycolmap.Database.open(temporary) as opened:
+                camera_of_done = {image.name: image.camera_id for image in opened.read_all_images()}
+            full = _keep_full(temporary, settings.max_features)
+            for names in groups:
+                left = [name for name in names if name not in full]
+                if not left:
+                    continue
+                first = next(p for p in listed if p.name == names[0])
+                lens = None if known is None else turned(known, quarters[first.name], first.name)
+                reader = _reader_options(settings, lens, first)
+                reader.existing_camera_id = next((camera_of_done[n] for n in names if n in camera_of_done), -1)
+                cancellable(
+                    pycolmap.extract_features,
+                    temporary,
+                    folder,
+                    image_names=left,
+                    camera_mode=pycolmap.CameraMode.SINGLE,
+                    reader_options=reader,
+                    extraction_options=options,
+                    device=pycolmap.Device.cpu,
+                )
         with pycolmap.Database.open(temporary) as opened:
             counts = {i.name: opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()}
         missing = [p.name for p in listed if p.name not in counts]
@@ -108,6 +117,16 @@ def extract_features(
     if few:
         print(f"note: {len(few)} photos have fewer than {FEW_FEATURES} features, {few[0]} for one", flush=True)
     print(f"{np.median(list(counts.values())):.0f} features in the median photo, {len(groups)} cameras", flush=True)
+
+
+def _keep_full(database: Path, count: int) -> set[str]:
+    """Names of the photos that have `count` features or more; those of the others are taken out of the database, which
+    pycolmap does for all photos only."""
+    poor = "WHERE image_id IN (SELECT image_id FROM keypoints WHERE rows < ?)"
+    with contextlib.closing(sqlite3.connect(database)) as opened, opened:
+        for table in ("descriptors", "keypoints"):
+            opened.execute(f"DELETE FROM {table} {poor}", (count,))
+        return {name for (name,) in opened.execute("SELECT name FROM images JOIN keypoints USING (image_id)")}
 
 
 def camera_groups(photos: list[Photo], mode: str) -> list[list[str]]:

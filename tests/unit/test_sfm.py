@@ -512,6 +512,28 @@ def features_of(folder, calibration=None):
     )
 
 
+def test_photos_of_low_contrast_have_features_too(capture, tmp_path):
+    (tmp_path / "photos").mkdir()
+    for index, name in enumerate(NAMES):
+        picture = np.asarray(Image.open(capture[0] / "photos" / name), dtype=float)
+        contrast = 0.06 if index in (1, 4) else 1.0
+        Image.fromarray(np.uint8(np.round((picture - 128) * contrast + 128))).save(tmp_path / "photos" / name)
+    features_of(tmp_path)
+    with pycolmap.Database.open(tmp_path / "features.db") as database:
+        counts = [database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()]
+        assert len(counts) == 6 and len(database.read_all_cameras()) == 1
+    assert min(counts) > 0.5 * max(counts)
+    match_features(
+        photos=tmp_path / "photos.json",
+        features=tmp_path / "features.db",
+        database=tmp_path / "database.db",
+        matches=tmp_path / "matches.json",
+        settings=PAIRS,
+        seed=0,
+    )
+    assert value(mapped(tmp_path), "registered") == 6
+
+
 def test_a_portrait_photo_of_a_scene_has_a_portrait_camera(tmp_path):
     (tmp_path / "photos").mkdir()
     noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
