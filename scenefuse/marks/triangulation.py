@@ -163,12 +163,12 @@ def intersect(images: list[pycolmap.Image], pixels: Array) -> tuple[Array | None
     lies beyond what the lens shows."""
     poses = np.array([image.cam_from_world().matrix() for image in images])
     cameras = [image.camera for image in images if image.camera is not None]
+    focal_px = np.array([camera.mean_focal_length() for camera in cameras])[:, None]
     normalised = np.array([ray_through(camera, pixel) for camera, pixel in zip(cameras, pixels)])
     if not np.isfinite(normalised).all():
         return None, np.inf
-    rows = normalised[:, :, None] * poses[:, 2:3, :] - poses[:, :2, :]
-    system = rows.reshape(-1, 4)
-    homogeneous = np.linalg.svd(system)[2][3]
+    rows = focal_px[:, None] * (normalised[:, :, None] * poses[:, 2:3, :] - poses[:, :2, :])
+    homogeneous = np.linalg.svd(rows.reshape(-1, 4))[2][3]
     if abs(homogeneous[3]) < 1e-9 * np.linalg.norm(homogeneous[:3]):
         return None, np.inf
     position = homogeneous[:3] / homogeneous[3]
@@ -176,11 +176,10 @@ def intersect(images: list[pycolmap.Image], pixels: Array) -> tuple[Array | None
         in_cam = poses[:, :, :3] @ position + poses[:, :, 3]
         if (in_cam[:, 2] <= 0).any():
             return None, np.inf
-        error = in_cam[:, :2] / in_cam[:, 2:] - normalised
+        seen, per_unit = in_cam[:, :2] / in_cam[:, 2:], focal_px / in_cam[:, 2:]
+        error = focal_px * (seen - normalised)
         # d(x/z, y/z) = (row_xy - (xy / z) row_z) / z
-        slope = (poses[:, :2, :3] - (in_cam[:, :2] / in_cam[:, 2:])[:, :, None] * poses[:, 2:3, :3]) / in_cam[
-            :, 2:, None
-        ]
+        slope = per_unit[:, :, None] * (poses[:, :2, :3] - seen[:, :, None] * poses[:, 2:3, :3])
         step, _, rank, _ = np.linalg.lstsq(slope.reshape(-1, 3), -error.reshape(-1), rcond=1e-6)
         if rank < 3:
             return None, np.inf

@@ -54,6 +54,27 @@ def test_two_noisy_photos_give_a_small_residual(model, tmp_path):
     assert np.linalg.norm(positions[0] - POINTS["roof"]) < 0.03
 
 
+def test_a_pixel_of_a_long_lens_weighs_more_than_one_of_a_wide_lens(tmp_path):
+    model, angles = pycolmap.Reconstruction(), np.radians([0.0, 90.0, 3.0, 93.0])
+    for index, (focal, angle) in enumerate(zip((1500.0, 1500.0, 9000.0, 9000.0), angles), 1):
+        camera = pycolmap.Camera.create_from_model_name(index, "SIMPLE_RADIAL", focal, 4000, 3000)
+        model.add_camera_with_trivial_rig(camera)
+        rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.array([0.0, 0.0, 10.0]))
+        image = pycolmap.Image(name=f"{index}.jpg", camera_id=index, image_id=index)
+        model.add_image_with_trivial_frame(image, pose)
+    clicks, rng = clicked(model, tmp_path, photos=[f"{index}.jpg" for index in range(1, 5)]), np.random.default_rng(0)
+    off, missed = [], []
+    for _ in range(40):
+        noisy = [replace(c, x_px=c.x_px + rng.normal(), y_px=c.y_px + rng.normal()) for c in clicks.rows]
+        _, positions, residuals = triangulate(replace(clicks, rows=tuple(noisy)), model, np.inf)
+        off.append(positions - list(POINTS.values()))
+        missed.append(residuals)
+    # Of distances from the rays the least squares lie 0.0055 off, and miss the clicks by 2.7 px.
+    assert np.sqrt((np.array(off) ** 2).sum(2).mean()) < 0.0025
+    assert np.sqrt((np.array(missed) ** 2).mean()) < 1.3
+
+
 def test_clicks_in_larger_originals_are_scaled(model, tmp_path):
     clicks = clicked(model, tmp_path, scale=2.0)
     sizes = {f"{i}.jpg": (1280, 960) for i in (1, 2, 3)}
