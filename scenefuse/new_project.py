@@ -13,7 +13,7 @@ import tyro
 from scenefuse.cloud.formats import READERS, columns_in_parts
 from scenefuse.core.settings import OWN_SETTINGS, PACKAGE, ROOT, schema_of
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.core.tables import Row, read_table, read_text
+from scenefuse.core.tables import Row, is_comment, read_table, read_text
 from scenefuse.core.transforms import FIXING_POINTS
 from scenefuse.photos.photo_files import MIN_OBJECT_PHOTOS, SUFFIXES, VIDEO_SUFFIXES, in_folders, photo_files
 
@@ -110,7 +110,7 @@ def project_rows(folder: Path, scene: Path | None, objects: Sequence[Path]) -> d
 
 def fill(table: Path, column: str, cells: Mapping[str, str]) -> None:
     """Write the cells of a column of a table of objects, by their names; unknown ones get a row, comments stay."""
-    rows, comments = read_table(table, "object"), [x for x in read_text(table).splitlines() if x.startswith("#")]
+    rows, comments = read_table(table, "object"), list(filter(is_comment, read_text(table).splitlines()))
     for name, cell in cells.items():
         rows.setdefault(name, {"object": name})[column] = cell
     columns = tuple(dict.fromkeys([*next(iter(rows.values())), column]))

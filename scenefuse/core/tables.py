@@ -24,7 +24,7 @@ def read_table(path: Path, key: str) -> dict[str, Row]:
         StageError: the file is missing or not text, has no such column or a column twice, a row has too few or too many
             cells, or two rows have the same key.
     """
-    lines = [line for line in io.StringIO(read_text(path), newline=None) if not _is_comment(line)]
+    lines = [line for line in io.StringIO(read_text(path), newline=None) if not is_comment(line)]
     written = [[cell.strip() for cell in row] for row in _split(lines, path)]
     header, *cells = [row for row in written if any(row)] or [[]]
     header = _cells(header)
@@ -57,7 +57,7 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
         StageError: the file is missing, or is not text.
     """
     lines = enumerate(read_text(path).splitlines(), 1)
-    return [(number, line) for number, line in lines if line.strip() and not _is_comment(line)]
+    return [(number, line) for number, line in lines if line.strip() and not is_comment(line)]
 
 
 def read_cells(path: Path) -> list[tuple[int, list[str]]]:
@@ -86,7 +86,7 @@ def _split(lines: Iterable[str], path: Path) -> Iterator[list[str]]:
         yield row
 
 
-def _is_comment(line: str) -> bool:
+def is_comment(line: str) -> bool:
     """Whether a line begins with #, perhaps in a spreadsheet's quotes."""
     return line.lstrip('"').startswith("#")
 

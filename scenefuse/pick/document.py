@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from scenefuse.core.stage import StageError, atomic_file, sha256
-from scenefuse.core.tables import read_cells, read_text
+from scenefuse.core.tables import is_comment, read_cells, read_text
 from scenefuse.crop.crop_scene import MIN_FIDUCIALS
 from scenefuse.marks.clicks import (
     HEADERS,
@@ -260,7 +260,7 @@ class Document:
 
     def _write(self, rows: Rows) -> None:
         lines = read_text(self.path).splitlines() if self.path.exists() else []
-        comments = [line for line in lines if line.startswith("#")]
+        comments = list(filter(is_comment, lines))
         text = "\n".join([*comments, "\t".join(HEADERS[self.kind]), *map(_line, rows)]) + "\n"
         try:
             # A link stays one: what it points to is replaced.

@@ -110,10 +110,11 @@ def test_a_user_s_comments_stay_in_a_table_that_gets_an_object(two_folders, work
     workflow(SUMMARY)
     run("close", prompts=(Path("clicks.tsv"),))
     table = Path("flight_completed/config/objects.tsv")
-    table.write_text(f"{table.read_text()}# barn\tflight\tits roof is gone\n")
+    comments = '# barn\tflight\tits roof is gone\n"# ""new"", as a spreadsheet quotes it"\n'
+    table.write_text(table.read_text() + comments)
     workflow("")
     run("close", "shed", prompts=(Path("clicks.tsv"),) * 2)
-    assert "# barn\tflight\tits roof is gone\n" in table.read_text() and len(read_table(table, "object")) == 2
+    assert comments in table.read_text() and len(read_table(table, "object")) == 2
 
 
 def test_clicks_are_of_the_objects_with_photos_beside_one_that_is_a_cloud(two_folders, workflow):

@@ -73,11 +73,12 @@ def test_a_file_of_points_is_edited_as_such_whatever_was_expected(path):
         document.choose_kind("labels")
 
 
-def test_comments_survive(path):
-    path.write_text(f"# by hand\n{TEXT}inside\ta.jpg\t1\t2\n")
+@pytest.mark.parametrize("comment", ["# by hand", '"# by ""hand"", as a spreadsheet quotes it"'])
+def test_comments_survive(path, comment):
+    path.write_text(f"{comment}\n{TEXT}inside\ta.jpg\t1\t2\n")
     document = Document(path, "labels")
     document.change((*document.rows, HEAD))
-    assert path.read_text().startswith("# by hand\nlabel\t") and len(Document(path, "labels").rows) == 2
+    assert path.read_text().startswith(f"{comment}\nlabel\t") and len(Document(path, "labels").rows) == 2
 
 
 @pytest.mark.parametrize(
