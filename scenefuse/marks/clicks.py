@@ -181,8 +181,9 @@ def _clicks(path: Path, kind: Kind, lines: Lines) -> Clicks:
         raise StageError(
             f"{path}: all clicks are within the first pixel; multiply shares by a photo's width and height"
         )
-    # One click marks a point in a photo, and one label a pixel; ends of lengths are checked by `read_ends`.
-    marks = [(c.photo, c.pixel.tolist() if kind == "labels" else c.label) for c in rows]
+    # One click marks a point in a photo, and one label a pixel, where a box may begin too; ends of lengths are checked
+    # by `read_ends`.
+    marks = [(c.photo, (c.label == "box", c.x_px, c.y_px) if kind == "labels" else c.label) for c in rows]
     for click, mark in zip(rows, marks):
         if kind != "lengths" and marks.count(mark) > 1:
             what = f"({click.x_px:g}, {click.y_px:g})" if kind == "labels" else click.name

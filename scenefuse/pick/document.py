@@ -98,12 +98,18 @@ def with_length(rows: Rows, text: str) -> tuple[Rows, tuple[str, str]]:
         raise StageError("write a name and a length in metres: bar 1.5") from None
     name = point_name(name)
     cells = [row.label.split("\t") for row in rows]
-    ends = list(dict.fromkeys([cell[2] for cell in cells if cell[0] == name] + list(ENDS)))
-    changed = [
-        replace(row, label=length_label(name, metres, cell[2])) if cell[0] == name else row
-        for row, cell in zip(rows, cells)
-    ]
-    return tuple(changed), (length_label(name, metres, ends[0]), length_label(name, metres, ends[1]))
+    ends = [*(cell[2] for cell in cells if cell[0] == name), *ENDS]
+    labels = {end: length_label(name, metres, end) for end in ends}
+    changed = [replace(row, label=labels[cell[2]]) if cell[0] == name else row for row, cell in zip(rows, cells)]
+    first, second, *_ = labels.values()
+    return tuple(changed), (first, second)
+
+
+def label_in(rows: Rows, label: str) -> str:
+    """A label of a point or an end, with the metres that its length has in the rows."""
+    name, *rest = label.split("\t")
+    metres = next((held[1:-1] for row in rows if (held := row.label.split("\t"))[0] == name), rest[:-1])
+    return "\t".join([name, *metres, *rest[-1:]])
 
 
 def without_nearest(rows: Rows, photo: str, x: float, y: float, within_px: float) -> Rows:
@@ -143,14 +149,8 @@ def problems(rows: Rows, kind: Kind, sizes: Sizes, min_inside: int = 1) -> list[
     found += [f"{name} is marked in one photo: click it in another one, too." for name in times if times[name] < 2]
     if kind == "points":
         return found + [f"{len(times)} of at least {MIN_FIDUCIALS} points are marked."] * (len(times) < MIN_FIDUCIALS)
-    ends = {(name, end) for name, _, end in (row.label.split("\t") for row in rows)}
-    metres = {(name, long) for name, long, _ in (row.label.split("\t") for row in rows)}
-    for name in dict.fromkeys(row.label.split("\t")[0] for row in rows):
-        if sum(other == name for other, _ in ends) < 2:
-            found.append(f"{name} has one end: click the other one, too.")
-        if sum(other == name for other, _ in metres) > 1:
-            found.append(f"{name} has two lengths: write it again.")
-    return found
+    ends = Counter(label.split("\t")[0] for label in dict.fromkeys(row.label for row in rows))
+    return found + [f"{name} has one end: click the other one, too." for name in ends if ends[name] < 2]
 
 
 def _label_problems(rows: Rows, min_inside: int) -> list[str]:
@@ -229,8 +229,7 @@ class Document:
         """Hold rows of the other kind; StageError where there are rows already."""
         if kind != self.kind and (self.rows or self.trouble):
             raise StageError(f"{self.path} holds {self.kind}; remove them all to begin with {kind}")
-        self.kind = kind
-        self._past, self._future = [], []
+        self.kind, self._past, self._future = kind, [], []
         self.version += 1
 
     def changed_on_disk(self) -> bool:

@@ -1,6 +1,6 @@
 """The tables of clicks of an object, the photos to click in, and what a person does to the table that is open."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +15,7 @@ from scenefuse.pick.document import (
     Document,
     Rows,
     Sizes,
+    label_in,
     point_name,
     problems,
     with_box,
@@ -211,7 +212,6 @@ class Editor:
         table: that is clicked.
         picture: the photo that is clicked in.
         tool: inside, outside or box, for labels.
-        point: label of the point or end that a click marks; "" for none.
         points: labels of the points or ends that a person has named, clicked or not.
     """
 
@@ -219,14 +219,20 @@ class Editor:
         self.table, self.picture = table, picture
         self.tool = "inside"
         self._named: tuple[str, ...] = ()
-        self.point = self.points[0] if self.points else ""
+        self._point = self.points[0] if self.points else ""
+
+    @property
+    def point(self) -> str:
+        """Label of the point or end that a click marks; "" for none."""
+        return label_in(self.table.document.rows, self._point)
 
     @property
     def points(self) -> list[str]:
         """Labels of all points or ends, in the order in which they came."""
         if self.table.document.kind == "labels":
             return []
-        return list(dict.fromkeys([*(row.label for row in self.table.document.rows), *self._named]))
+        rows = self.table.document.rows
+        return list(dict.fromkeys([*(row.label for row in rows), *(label_in(rows, label) for label in self._named)]))
 
     @property
     def here(self) -> Rows:
@@ -248,16 +254,18 @@ class Editor:
 
     def remove(self, x: float, y: float, within_px: float) -> None:
         """Remove the click that is nearest to a pixel."""
-        self._change(lambda rows: without_nearest(rows, self.picture.name, x, y, within_px))
+        document = self.table.document
+        document.change(without_nearest(document.rows, self.picture.name, x, y, within_px))
 
     def draw_box(self, corners: Corners) -> None:
         """Draw a box around the object."""
-        self.tool = "inside"
-        self._change(lambda rows: with_box(rows, self.picture.name, corners, self.table.sizes))
+        self.tool, document = "inside", self.table.document
+        document.change(with_box(document.rows, self.picture.name, corners, self.table.sizes))
 
     def remove_lost(self) -> None:
         """Remove clicks in photos that are no longer there."""
-        self._change(lambda rows: tuple(row for row in rows if row.photo in self.table.pictures))
+        document = self.table.document
+        document.change(tuple(row for row in document.rows if row.photo in self.table.pictures))
 
     def undo(self, forward: bool = False) -> None:
         """One change back, or forward again."""
@@ -280,17 +288,14 @@ class Editor:
             document.change(rows)
         else:
             self._named = (point_name(text),)
-        self.point = self._named[0]
+        self.choose_point(self._named[0])
 
     def choose_point(self, label: str) -> None:
         """Take a point or an end that is listed."""
-        self.point = label
+        self._point = label
 
     def _choose_other_end(self) -> None:
         """After one end of a length comes the other, where the photo does not have it yet; then the first again."""
         here = {row.label for row in self.here}
         ends = [label for label in self.points if label.split("\t")[0] == self.point.split("\t")[0]]
-        self.point = next((end for end in ends if end not in here), ends[0])
-
-    def _change(self, edit: Callable[[Rows], Rows]) -> None:
-        self.table.document.change(edit(self.table.document.rows))
+        self.choose_point(next((end for end in ends if end not in here), ends[0]))

@@ -62,6 +62,28 @@ def test_after_one_end_of_a_length_comes_the_other_in_each_photo(edited):
     assert ends == [(a, "a.jpg"), (b, "a.jpg"), (a, "b.jpg"), (b, "b.jpg")]
 
 
+def test_a_click_where_a_box_begins_is_read_back(edited):
+    editor = edited("labels")
+    editor.draw_box(((0, 0), (50, 40)))
+    editor.click(0, 0)
+    again = Document(editor.table.document.path, "labels")
+    assert again.rows == editor.here and not again.trouble
+
+
+def test_a_length_whose_change_is_undone_is_clicked_with_the_metres_that_it_has(edited):
+    editor = edited("lengths")
+    editor.name_point("bar 1.5")
+    editor.click(1, 2)
+    editor.name_point("bar 2")
+    assert editor.points == ["bar\t2\ta", "bar\t2\tb"]
+    editor.undo()
+    editor.choose_point("bar\t2\tb")
+    assert editor.points == ["bar\t1.5\ta", "bar\t1.5\tb"] and editor.point == "bar\t1.5\tb"
+    editor.click(3, 4)
+    again = Document(editor.table.document.path, "lengths")
+    assert [row.label for row in again.rows] == editor.points and not again.trouble
+
+
 def test_clicks_in_photos_that_are_gone_can_be_removed(edited):
     editor = edited("labels")
     editor.table.document.change((Click("inside", "gone.jpg", 1, 2), Click("inside", "b.jpg", 3, 4)))

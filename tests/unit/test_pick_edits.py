@@ -73,11 +73,6 @@ def test_with_a_corner_the_whole_box_is_removed():
         ((Click("hat", "a.jpg", 1, 1),), "points", "1 of at least 4 points"),
         ((Click("bar\t2\ta", "a.jpg", 1, 1),), "lengths", "bar, 2 m: a is marked in one photo"),
         ((Click("bar\t2\ta", "a.jpg", 1, 1),), "lengths", "bar has one end"),
-        (
-            (Click("bar\t2\ta", "a.jpg", 1, 1), Click("bar\t3\ta", "a.jpg", 1, 1)),
-            "lengths",
-            "two lengths: write it again",
-        ),
     ],
 )
 def test_what_the_workflow_would_refuse_is_said(rows, kind, expected):
