@@ -128,7 +128,7 @@ def _read(path: Path, flags: int) -> NDArray[Any]:
     if not Path(path).is_file():
         raise StageError(f"{path} does not exist; rerun the stage that writes it")
     with open_picture(path) as image:
-        kind, orientation = image.format, image.getexif().get(0x0112)
+        kind, orientation = image.format, image.getexif().get(0x0112, 1)
     turned = orientation - 1 if kind == "TIFF" and orientation in range(1, 9) else 0
     # By name OpenCV reads no TIFF that lies on its side; all others it stands upright, whatever is asked.
     pixels = cv2.imdecode(np.fromfile(path, np.uint8), flags)
