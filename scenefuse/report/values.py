@@ -86,16 +86,23 @@ def number(item: Any) -> str:
 def percent(share: float) -> str:
     """A share of 1 in per cent, to two digits; next to all and next to nothing are never rounded to all and nothing."""
     value = 100 * share
-    rest = min(value, 100 - value)
-    digits = 0 if rest >= 10 or rest <= 0 else 1 if rest >= 0.1 else 2
+    digits = 0 if value <= 0 or value >= 100 or 10 <= value <= 90 else _decimals(value)
     return f"{value:.{digits}f} %"
+
+
+def _decimals(value: float) -> int:
+    """How many decimals keep a number of per cent from all and from nothing; one, where it is neither nor near."""
+    rest = round(min(value, 100 - value), 9)
+    return max(1, math.ceil(-math.log10(rest))) if rest > 0 else 1
 
 
 def percents(missing: Sequence[float]) -> list[str]:
     """What some shares leave of a whole, what they take together, and each: per cent that sum to 100, "" for none."""
-    digits = 1 if sum(missing) >= 0.001 else 2
-    each = [round(100 * share, digits) for share in missing]
-    return [f"{part:.{digits}f} %" if part else "" for part in (100 - sum(each), sum(each), *each)]
+    digits = _decimals(100 * sum(missing))
+    together, each = round(100 * sum(missing), digits), [round(100 * share, digits) for share in missing]
+    each[each.index(max(each))] += together - sum(each)
+    texts = [f"{part:.{digits}f} %" if round(part, digits) else "" for part in (together, *each)]
+    return [f"{100 - together:.{digits}f} %", *texts]
 
 
 def length(value: float, unit: str) -> str:

@@ -527,11 +527,14 @@ def test_a_run_ends_in_three_lines(results):
 
 
 def test_shares_of_a_whole_sum_to_100_as_they_are_written():
-    for missing in ([0.0087, 0.0002, 0.0032], [1 / 3, 1 / 3, 1 / 3], [0.00024, 0.00024], [0.0]):
+    for missing in ([0.0087, 0.0002, 0.0032], [1 / 3, 1 / 3, 1 / 3], [0.00024, 0.00024], [0.3335, 0.3335, 0.333], [0.0]):
         there, together, *each = [float(text.removesuffix(" %") or 0) for text in percents(missing)]
         assert there + together == pytest.approx(100) and sum(each) == pytest.approx(together)
         assert together == pytest.approx(100 * sum(missing), abs=0.15)
     assert percents([0.0087, 0.0002, 0.0032]) == ["98.8 %", "1.2 %", "0.9 %", "", "0.3 %"]
+    # All and nothing are neither left out nor said of what is next to them.
+    there = [percents([share, 0.0])[0] for share in (0.0, 0.00004, 0.99996, 1.0)]
+    assert there == ["100.0 %", "99.996 %", "0.004 %", "0.0 %"] and percents([0.0004] * 3)[0] == "99.9 %"
 
 
 def test_an_object_says_when_it_was_photographed_and_how_its_lengths_follow_from_the_scene_s(results):
@@ -604,8 +607,8 @@ def test_a_long_advice_is_cut_in_summary_and_whole_in_details(results):
 
 
 def test_shares_and_lengths_are_written_as_people_do():
-    assert [percent(share) for share in (0.0, 0.00021, 0.018, 0.5, 0.982, 0.9996, 1.0)] == [
-        *("0 %", "0.02 %", "1.8 %", "50 %", "98.2 %", "99.96 %", "100 %")
+    assert [percent(share) for share in (0.0, 0.00002, 0.00021, 0.018, 0.5, 0.982, 0.9996, 0.99997, 1.0)] == [
+        *("0 %", "0.002 %", "0.02 %", "1.8 %", "50 %", "98.2 %", "99.96 %", "99.997 %", "100 %")
     ]
     lengths = [(0.0072, "m"), (0.256, "m"), (11.42, "m"), (0.5, "scene units"), (1234.5, "m")]
     assert [length(*given) for given in lengths] == ["7.20 mm", "25.6 cm", "11.4 m", "0.500 scene units", "1,234 m"]
@@ -642,12 +645,14 @@ def test_a_scene_to_which_nothing_was_added_is_not_called_completed(results):
 def test_what_is_completed_in_part_alone_is_not_called_completed():
     row = {"object": "house", "status": "registered", "surface_missing": 0.913, "surface_never_seen": 0.913}
     assert object_facts(row)["Result"] == "Found in the scene and completed to 8.7 %"
+    facts = object_facts(row | {"surface_missing": 1.0, "surface_never_seen": 1.0})
+    assert facts["Result"].endswith("completed to 0.0 %") and facts["Surface"].startswith("0.0 % is there, 100.0 %")
 
 
 def test_the_result_and_the_surface_of_an_object_name_the_same_share():
     row = {"object": "house", "status": "registered", "surface_missing": 0.01152, "surface_never_seen": 0.00907}
     facts = object_facts(row | {"surface_contradicted": 0.00245})
-    assert facts["Result"].endswith("completed to 98.9 %") and facts["Surface"].startswith("98.9 % is there")
+    assert facts["Result"].endswith("completed to 98.8 %") and facts["Surface"].startswith("98.8 % is there")
 
 
 def test_a_project_is_called_by_its_folder_and_its_objects(tmp_path, monkeypatch):
