@@ -78,7 +78,7 @@ def object_facts(row: Row) -> dict[str, str]:
     if "added_points" in has:
         facts["File"] = f"{folder}/fused.ply with its surroundings (local frame, {_plural(unit)}; for CloudCompare)"
     elif status == ALONE:
-        facts["File"] = f"{folder}/object.ply (a frame of its own, {_plural(unit)})"
+        facts["File"] = f"{folder}/object.ply (a frame of its own, {_plural(has.get('unit', 'object units'))})"
     return _capital(facts | _next(has))
 
 
@@ -291,22 +291,16 @@ def closing_lines(summary: Path) -> str:
     steps = [f"{row['object']}: {object_facts(row)['Result']}" for row in objects if row not in done]
     found = {row["object"]: object_facts(row).get("Next", "") for row in done}
     steps += [f"{name}: {step}" for name, text in found.items() for step in text.splitlines()]
+    first, *more = steps or ["open the result in CloudCompare or QGIS"]
     page = summary / "report.html"
     return "\n".join(
         [
             f"Result: {len(done)} of {len(objects)} objects completed"
             + (f"; {', '.join(map(str, files))}" if files else ""),
             f"Report: {page if page.is_file() else summary / 'summary.txt'}",
-            f"Next:   {_first(steps)}",
+            f"Next:   {first}" + (f" ({len(more)} more in the report)" if more else ""),
         ]
     )
-
-
-def _first(steps: list[str]) -> str:
-    """The first of some steps, and that there are more."""
-    if not steps:
-        return "nothing is missing; open the result in CloudCompare or QGIS"
-    return steps[0] + (f" ({len(steps) - 1} more in the report)" if len(steps) > 1 else "")
 
 
 def photographed(photos_json: Path, folder: Path) -> str | None:

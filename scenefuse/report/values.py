@@ -49,8 +49,10 @@ def load(path: Path) -> Fields:
 
 def read_table(path: Path) -> pd.DataFrame:
     """A table of the summary, NaN where a cell holds nothing; without rows where there is no such table."""
+    # Names may be numbers.
+    words = dict.fromkeys(("object", "scene", "completed_by", "made_by"), str)
     try:
-        return pd.read_csv(path, sep="\t", na_values=["-"], keep_default_na=False, dtype={"object": str, "scene": str})
+        return pd.read_csv(path, sep="\t", na_values=["-"], keep_default_na=False, dtype=words)
     except (FileNotFoundError, pd.errors.EmptyDataError):
         return pd.DataFrame()
 
@@ -74,8 +76,6 @@ def number(item: Any) -> str:
     """Four significant digits, no exponent for everyday numbers; '-' for what is absent or no finite number."""
     if isinstance(item, bool):
         return "yes" if item else "no"
-    if isinstance(item, int):
-        return str(item)
     if isinstance(item, float):
         if not math.isfinite(item):
             return "-"

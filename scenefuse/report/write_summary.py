@@ -67,7 +67,7 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
     }
     for name, table in tables.items():
         with atomic_file(summary / f"{name}.tsv") as temporary:
-            table.to_csv(temporary, sep="\t", index=False, na_rep="-", float_format="%.8g")
+            table.to_csv(temporary, sep="\t", index=False, na_rep="-", float_format="%.10g")
     texts = {"details": details_text(found, tables), "summary": summary_text(found, tables, made_by(summary))}
     for name, text in texts.items():
         with atomic_file(summary / f"{name}.txt") as temporary:
@@ -131,12 +131,13 @@ def runtime_table(benchmarks: Path, forecast: Mapping[str, float]) -> pd.DataFra
     jobs = pd.DataFrame(rows, columns=["rule", *SECONDS, "max_rss_mb"])
     table = jobs.groupby("rule", sort=True).agg(
         jobs=("seconds", "size"),
-        **{name: (name, "sum") for name in SECONDS},
+        # What is not known of one job is not known of them all.
+        **{name: (name, lambda column: column.sum(skipna=False)) for name in SECONDS},
         longest_seconds=("seconds", "max"),
         max_rss_mb=("max_rss_mb", "max"),
     )
     table = table.sort_values("seconds", ascending=False).reset_index()
-    sums = [jobs[name].sum() for name in SECONDS]
+    sums = [jobs[name].sum(skipna=False) for name in SECONDS]
     table.loc[len(table)] = ["total", len(jobs), *sums, jobs["seconds"].max(), jobs["max_rss_mb"].max()]
     return table
 
@@ -176,13 +177,16 @@ def objects_table(run: RunSummary, inputs: RunInputs) -> pd.DataFrame:
     for item, folder, scene in zip(run.objects, inputs.objects, inputs.scene_of):
         variant = run.variants[0]
         fields = item.variants[variant] | item.fusion | item.stages
+        # A pose that was refused says neither how large an object is nor how well that is known.
+        for name in ("metrics.object.size", "fine.scale_sd_log") if item.status(variant) == "unregistered" else ():
+            fields.pop(name, None)
         unit, size = unit_of(fields, "metrics.object.size"), find(fields, "metrics.object.size") or [None] * 3
         rows.append(
             {"object": item.name, "status": item.status(variant), "reason": item.reason(variant)}
             | dict(zip(("length", "width", "height"), size))
             | _columns(fields, "objects")
-            | {"unit": unit or unit_of(fields, "crop.diagonal"), "scene": scene or None}
-            | {"crs": find(scenes.get(scene, {}), "georeference.crs")}
+            | {"unit": unit or unit_of(fields, "crop.diagonal") or find(fields, "sparse.length_unit")}
+            | {"scene": scene or None, "crs": find(scenes.get(scene, {}), "georeference.crs")}
             | {"scene_scale_sd_log": _scale_sd(scenes.get(scene, {}))}
             | {"photographed": photographed(folder / "photos.json", folder / "frames")}
             | {"missing": item.missing or None, "error": why_missing(item.failed) if item.missing else None}
@@ -253,18 +257,12 @@ def _heading(text: str) -> list[str]:
 
 
 def _line(label: str, text: str, most: int | None = None) -> list[str]:
-    """`label   text`, wrapped, continuation lines indented; `most` is how many a line of the text may take."""
-    lines = list[str]()
+    """`label   text`, wrapped with paths whole, continuation lines indented; `most` is how many a line may take."""
+    lines, wrapper = list[str](), textwrap.TextWrapper(WIDTH, break_long_words=False, break_on_hyphens=False)
+    wrapper.subsequent_indent, wrapper.max_lines, wrapper.placeholder = " " * 14, most, " ... (details.txt)"
     for part in text.splitlines():
-        start = f"{'' if lines else label:<13} "
-        lines += textwrap.wrap(
-            part,
-            WIDTH,
-            initial_indent=start,
-            subsequent_indent=" " * 14,
-            max_lines=most,
-            placeholder=" ... (details.txt)",
-        )
+        wrapper.initial_indent = f"{'' if lines else label:<13} "
+        lines += wrapper.wrap(part)
     return lines
 
 

@@ -69,7 +69,7 @@ def test_two_folders_and_clicks_become_a_project_and_its_run(two_folders, workfl
     assert said[-3:] == [
         "Result: 1 of 1 objects completed",
         "Report: flight_completed/results/summary/report.html",
-        "Next:   nothing is missing; open the result in CloudCompare or QGIS",
+        "Next:   open the result in CloudCompare or QGIS",
     ]
 
 

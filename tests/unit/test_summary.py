@@ -15,7 +15,7 @@ from scenefuse.core.job_records import KILLED, NO_LOG, NOT_ACCEPTED, JobRecords,
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.report.facts import closing_lines, object_facts, scene_facts, title_of
 from scenefuse.report.run_summary import RunInputs
-from scenefuse.report.values import find, flatten, length, load, number, percent, percents
+from scenefuse.report.values import find, flatten, length, load, number, percent, percents, read_table, records
 from scenefuse.report.write_report import write_report
 from scenefuse.report.write_summary import runtime_table, write_summary
 
@@ -153,11 +153,65 @@ def test_objects_and_scenes(results):
     assert read(summary, "scenes").loc[0, "registered"] == 59
 
 
+def test_counts_and_places_are_written_whole_beside_a_scene_without_any(results):
+    where = {"origin_longitude_deg": quantity(-122.12346, "deg"), "length_unit": quantity("m", "")}
+    write_json(results / "scenes/demo/georeference.json", where)
+    write_json(results / "scenes/demo/dense.json", {"points": quantity(1_234_567_891, "points")})
+    run = RunInputs(
+        scenes=(results / "scenes/demo", results / "scenes/none"),
+        chunks=2,
+        variants=["full"],
+        jobs=JobRecords(results / "logs", results / "benchmarks"),
+    )
+    write_summary(run=run, summary=results / "summary")
+    row = (results / "summary/scenes.tsv").read_text().splitlines()[1].split("\t")
+    assert "1234567891" in row and "-122.12346" in row
+
+
+def test_a_refused_pose_says_neither_how_large_an_object_is_nor_how_well_that_is_known(results):
+    balloon = results / "objects/balloon"
+    metrics = json.loads((balloon / "metrics.json").read_text()) | {"object": {"size": quantity([3.0, 2.0, 1.0], "m")}}
+    write_json(balloon / "metrics.json", metrics)
+    fine = json.loads((balloon / "registration/full/fine.json").read_text()) | {"scale_sd_log": quantity(0.003, "1")}
+    write_json(balloon / "registration/full/fine.json", fine)
+    summary = summarise(results)
+    row = read(summary, "objects").set_index("object").loc["balloon"]
+    assert row[["length", "height", "scale_sd_log"]].isna().all() and row["unit"] == "m"
+    said = (summary / "summary.txt").read_text().split("object balloon")[1].split("object sculpture")[0]
+    assert "Not added to the scene: weak." in said and not re.search("Size|Scale|Accuracy", said)
+
+
+def test_a_file_s_path_is_not_broken_where_its_object_s_name_has_hyphens(results):
+    name = "the-north-wing-of-the-old-mill"
+    (results / "objects/house").rename(results / "objects" / name)
+    write_json(results / f"objects/{name}/missing.json", {"stations": quantity(3, "")})
+    text = (summarise(results, [name]) / "summary.txt").read_text()
+    for file in ("fused.ply", "next_photos.csv"):
+        assert f"results/objects/{name}/{file}" in text
+
+
+def test_an_object_that_is_called_by_a_number_keeps_its_name(results):
+    write_json(results / "scenes/demo/completed.json", {"added_points": quantity({"007": 30}, "points")})
+    rows = records(read_table(summarise(results, ["balloon"]) / "scenes.tsv"))
+    assert rows[0]["completed_by"] == "007"
+
+
 def test_runtime_sums_over_jobs_and_totals(results):
     table = read(summarise(results), "runtime").set_index("rule")
     assert table.loc["nerf", ["jobs", "seconds", "longest_seconds", "max_rss_mb"]].tolist() == [2, 150, 100, 1200]
     assert table.loc["total", "seconds"] == pytest.approx(150.2)
     assert np.isnan(table.loc["fine", "max_rss_mb"])
+
+
+def test_a_forecast_of_some_jobs_is_not_shown_as_that_of_all(results):
+    """A second run forecasts what it makes again; the jobs of the first are counted too."""
+    jobs = {str(path): 10.0 for path in (results / "benchmarks").rglob("*.tsv")}
+    table = runtime_table(results / "benchmarks", jobs).set_index("rule")
+    assert table.loc[["nerf", "total"], "forecast_seconds"].tolist() == [20.0, 30.0]
+    del jobs[str(results / "benchmarks/nerf/house.tsv")]
+    again = runtime_table(results / "benchmarks", jobs).set_index("rule")["forecast_seconds"]
+    assert again["fine"] == 10.0 and np.isnan(again["nerf"]) and np.isnan(again["total"])
+    assert again.index.tolist() == table.index.tolist()
 
 
 def test_runtime_of_no_benchmarks_and_of_damaged_ones(tmp_path):
@@ -189,9 +243,12 @@ def test_an_object_in_no_scene_is_done_with_its_cloud(results):
     assert "object arm: missing" in text
     # What an earlier run with a scene left is not its own.
     own = text[text.index("object head") : text.index("object arm")]
+    assert "object.ply (a frame of its own, object units)" in own
     assert "fusion" not in own and "registration" not in own and "cloud" in own
     assert read(summary, "objects").set_index("object").loc["head", "points"] > 0
+    write_json(head / "sparse.json", {"length_unit": quantity("m", "")})
     page = report(results, lone=("head",))
+    assert "(a frame of its own, metres)" in page
     assert '<span class="badge ok">by itself</span>' in page and "it lies in no scene" in page
 
 
@@ -527,7 +584,7 @@ def test_a_run_ends_in_three_lines(results):
 
 
 def test_shares_of_a_whole_sum_to_100_as_they_are_written():
-    for missing in ([0.0087, 0.0002, 0.0032], [1 / 3, 1 / 3, 1 / 3], [0.00024, 0.00024], [0.3335, 0.3335, 0.333], [0.0]):
+    for missing in ([0.0087, 0.0002, 0.0032], [1 / 3] * 3, [0.00024, 0.00024], [0.3335, 0.3335, 0.333], [0.0]):
         there, together, *each = [float(text.removesuffix(" %") or 0) for text in percents(missing)]
         assert there + together == pytest.approx(100) and sum(each) == pytest.approx(together)
         assert together == pytest.approx(100 * sum(missing), abs=0.15)
