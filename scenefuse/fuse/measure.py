@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.cloud_file import NEIGHBOURS
-from scenefuse.cloud.clouds import Cloud, spacing
+from scenefuse.cloud.clouds import Cloud, sampled_rows, spacing, voxels
+from scenefuse.cloud.readers.columns import AT_ONCE
 from scenefuse.core.stage import threads
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import UP, Array, Sim3
 from scenefuse.geometry.icp import similarity_rows
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Matches, Photos, match_in
 from scenefuse.geometry.surface import normals_at
@@ -100,18 +101,39 @@ def supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> ND
 
 
 def with_normals(cloud: Cloud, views: Sequence[View] = ()) -> Cloud:
-    """The cloud, with normals of local planes where it has none, towards the nearest camera; without cameras their side
-    is unknown."""
+    """The cloud, with normals of local planes where it has none, which face outwards."""
     if cloud.normals is not None:
         return cloud
-    if len(cloud) < 3:
-        return replace(cloud, normals=np.tile(np.array([0, 0, 1], np.float32), (len(cloud), 1)))
-    normals = normals_at(cloud.points, cloud.points)
+    if len(cloud) <= NEIGHBOURS:
+        return replace(cloud, normals=np.tile(UP.astype(np.float32), (len(cloud), 1)))
+    normals, some = normals_at(cloud.points, cloud.points), sampled_rows(len(cloud), AT_ONCE, seed=0)
+    outward = _outward(cloud.points[some], normals[some], views)
+    near = cKDTree(cloud.points[some]).query(cloud.points, workers=threads())[1]
+    normals *= np.where((normals * outward[near]).sum(1, keepdims=True) < 0, -1.0, 1.0)
+    return replace(cloud, normals=normals.astype(np.float32))
+
+
+def _outward(points: Array, normals: Array, views: Sequence[View]) -> Array:
+    """Normals (N, 3) of points (N, 3), consistent with their neighbours', and most of them towards the nearest camera,
+    which may lie below a roof that others see; without cameras, those of what is highest in a place upwards."""
+    import open3d as o3d
+
+    local = points - points.mean(0)
+    size = float(np.ptp(local, axis=0).max())
+    # Of points on a lattice or in one plane, the triangulation takes the square of their number in time, or fails.
+    shaken = local + np.random.default_rng(0).normal(0, 1e-6 * size, local.shape)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(shaken))
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    cloud.orient_normals_consistent_tangent_plane(NEIGHBOURS)
+    turned = np.asarray(cloud.normals)
     if views:
         centres = np.array([view.centre for view in views])
-        towards = centres[cKDTree(centres).query(cloud.points, workers=threads())[1]] - cloud.points
-        normals *= np.where((towards * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
-    return replace(cloud, normals=normals.astype(np.float32))
+        facing = ((centres[cKDTree(centres).query(points, workers=threads())[1]] - points) * turned).sum(1)
+    else:
+        falling = np.argsort(-points[:, 2])
+        place = voxels(local[falling] * [1, 1, 0], RESOLUTION * size)[0]
+        facing = turned[falling[np.unique(place, return_index=True)[1]], 2]
+    return -turned if np.sign(facing).sum() < 0 else turned
 
 
 def with_evidence(known: Measured, otherwise: Evidence, of_pose: Array | float = 0.0) -> Cloud:

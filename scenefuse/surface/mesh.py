@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, voxels, within
+from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, within
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import MARGIN, MIN_AGREEING, SAME_PLACE_SPACINGS
@@ -103,7 +103,7 @@ def make_mesh(cloud: Cloud, views: list[View], photos: Photos | None = None) -> 
         cloud = voxel_downsample(cloud, step)
     if len(cloud) < count:
         notes.append(f"{len(cloud):,} of {count:,} points were used, {step:.3g} apart")
-    cloud = oriented(cloud, views)
+    cloud = with_normals(cloud, views)
     points, faces, normals = _poisson(cloud, step)
     tree = cKDTree(cloud.points)
     confirmed = cloud.fields.get("evidence", np.zeros(len(cloud))) == Evidence.MEASURED
@@ -139,46 +139,20 @@ def make_mesh(cloud: Cloud, views: list[View], photos: Photos | None = None) -> 
     return replace(whole.part(kept), open_area=float(whole.areas()[is_open].sum()))
 
 
-def oriented(cloud: Cloud, views: list[View]) -> Cloud:
-    """The cloud with normals that face outwards: its own; else those of local planes, towards the nearest camera, or
-    without cameras consistent with their neighbours."""
-    if cloud.normals is not None:
-        return cloud
-    cloud = with_normals(cloud, views)
-    if views:
-        return cloud
-    # Of points on a lattice or in one plane, the triangulation takes the square of their number in time, or fails.
-    shaken = cloud.points + np.random.default_rng(0).normal(0, 1e-6 * cloud.diagonal, cloud.points.shape)
-    points = _open3d_cloud(replace(cloud, points=shaken), cloud.points.mean(0))
-    points.orient_normals_consistent_tangent_plane(NEIGHBOURS)
-    normals = np.asarray(points.normals).astype(np.float32)
-    # Open3D turns all of them inwards or outwards: what is highest in a place faces up.
-    falling = np.argsort(-cloud.points[:, 2])
-    place = voxels(cloud.points[falling] * [1, 1, 0], MARGIN * cloud.diagonal)[0]
-    highest = falling[np.unique(place, return_index=True)[1]]
-    return replace(cloud, normals=-normals if normals[highest, 2].sum() < 0 else normals)
-
-
-def _open3d_cloud(cloud: Cloud, middle: Array):  # type: ignore[no-untyped-def]
-    import open3d as o3d
-
-    assert cloud.normals is not None
-    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points - middle))
-    points.normals = o3d.utility.Vector3dVector(cloud.normals.astype(np.float64))
-    return points
-
-
 def _poisson(cloud: Cloud, step: float) -> tuple[Array, Rows, NDArray[np.float32]]:
     """Vertices (V, 3), faces (F, 3) and normals (V, 3) of the closed candidate, in cells of the points' spacing."""
     import open3d as o3d
 
+    assert cloud.normals is not None
     middle = cloud.points.mean(0)
+    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points - middle))
+    points.normals = o3d.utility.Vector3dVector(cloud.normals.astype(np.float64))
     side = BEYOND_BOX * float(np.ptp(cloud.points, axis=0).max())
     # A surface of MAX_POINTS has no more levels.
     most = np.ceil(np.log2(MAX_POINTS) / 2) + 1
     depth = int(np.clip(np.ceil(np.log2(side / step)), 1, most))
     mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-        _open3d_cloud(cloud, middle), depth=depth, scale=BEYOND_BOX, n_threads=threads()
+        points, depth=depth, scale=BEYOND_BOX, n_threads=threads()
     )
     mesh.remove_degenerate_triangles()
     mesh.compute_vertex_normals()

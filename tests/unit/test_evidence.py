@@ -9,7 +9,7 @@ from support.photographed_plane import BLANK, photographs
 
 from scenefuse.cloud.clouds import Cloud, concatenate
 from scenefuse.core.stage import value
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import Sim3, look_at
 from scenefuse.fuse import compare, measure, modes
 from scenefuse.fuse.compare import Reason, better_measured
 from scenefuse.fuse.fuse_object import evidence_report
@@ -71,6 +71,21 @@ def test_a_cloud_without_normals_is_measured_as_one_with_them(near, far, bare):
 
 
 @pytest.mark.slow
+def test_a_roof_without_normals_is_measured_though_cameras_below_it_are_nearer():
+    above, roof, low = photographs(8, 3.0), sheet(-0.6, 0.6, 0.04).points, []
+    y, z = (a.ravel() for a in np.meshgrid(np.arange(-0.6, 0.6, 0.04), np.arange(-0.6, 0, 0.04)))
+    for turn in Rotation.from_euler("z", np.arange(0, 360, 45)[:, None], degrees=True):
+        pose = np.eye(4)
+        pose[:3, :3] = look_at(turn.apply([1.5, 0, -0.3]), [0, 0, -0.3], [0, 0, 1])
+        pose[:3, 3] = -pose[:3, :3] @ turn.apply([1.5, 0, -0.3])
+        low.append(replace(above[0], name=f"{len(low)} low", cam_from_world=pose, pixels=0 * above[0].pixels))
+    quarter = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    walls = [np.column_stack([0 * y + 0.6, y, z]) @ np.linalg.matrix_power(quarter, k) for k in range(4)]
+    bare = Cloud(np.concatenate([roof, *walls]))
+    found = measure.measure(bare, pack([*above, *low]), bare.diagonal)
+    assert found.surface[: len(roof)].mean() > 0.9
+
+
 def test_a_rough_object_does_not_take_the_place_of_a_smooth_scene(near, far):
     rough, smooth = sheet(-0.4, 0.4, 0.015, noise=0.012), sheet(-0.4, 0.4, 0.02)
     of_rough, of_smooth = (np.abs(cloud.points[:, 0]) < 0.3 for cloud in (rough, smooth))
