@@ -270,12 +270,16 @@ def video_size(source: Path) -> tuple[int, int, int]:
 
 
 def _decode(source: Path, pictures: bool) -> Iterator[tuple[float, NDArray[Any] | None]]:
-    """When each frame of a video is shown (s), in order, and the frame, None where it is lost; without `pictures` they
-    are only counted, which is much faster."""
+    """When each frame of a video is shown (s), in order, and the frame, its pixels made square, None where it is lost;
+    without `pictures` they are only counted, which is much faster."""
     video = cv2.VideoCapture(str(source))
+    wide, high = (video.get(kind) or 1.0 for kind in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
     try:
         while video.grab():
-            yield video.get(cv2.CAP_PROP_POS_MSEC) / 1000, video.retrieve()[1] if pictures else None
+            frame = video.retrieve()[1] if pictures else None
+            if frame is not None and wide != high:
+                frame = cv2.resize(frame, None, None, min(wide / high, 1.0), min(high / wide, 1.0), cv2.INTER_AREA)
+            yield video.get(cv2.CAP_PROP_POS_MSEC) / 1000, frame
     finally:
         video.release()
 

@@ -104,8 +104,7 @@ def _degrees(value: Any, reference: Any, negative: str) -> float | None:
 
 def _altitude(value: Any, reference: Any) -> float | None:
     """Metres, negative where value or reference say so; None where there are none."""
-    if isinstance(reference, bytes) and reference[:1] < b"0":
-        reference = tuple(reference)
+    reference = tuple(reference) if isinstance(reference, bytes) and reference[:1] < b"0" else reference
     # EXIF 3.0: 1 is below the ellipsoid, or whatever zero; 3 below the sea. No photo is taken 100 km up.
     (altitude, *_), (code, *_) = _parts(value, 1e5) or [None], _parts(reference) or [None]
     return altitude if altitude is None or code not in (1, 3) else -abs(altitude)

@@ -176,6 +176,20 @@ def test_a_video_that_was_filmed_upright_is_stood_upright(tmp_path):
     assert {(photo.width, photo.height) for photo in listed(tmp_path, path)[0]} == {(96, 128)}
 
 
+@pytest.mark.parametrize(("wide", "high", "size"), [(4, 3, (128, 72)), (8, 9, (114, 96)), (0, 1, (128, 96))])
+def test_a_video_whose_pixels_are_not_square_gives_frames_whose_are(tmp_path, wide, high, size):
+    path = film(tmp_path / "camcorder.mp4")
+    content, box = bytearray(path.read_bytes()), struct.pack(">I4sII", 16, b"pasp", wide, high)
+    entry = content.index(b"mp4v", content.index(b"stsd")) - 4
+    end = entry + int.from_bytes(content[entry : entry + 4], "big")
+    content[end:end] = box
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"mp4v"):
+        at = content.index(name, content.index(b"moov")) - 4
+        content[at : at + 4] = (int.from_bytes(content[at : at + 4], "big") + len(box)).to_bytes(4, "big")
+    path.write_bytes(content)
+    assert {(photo.width, photo.height) for photo in listed(tmp_path, path)[0]} == {size}
+
+
 def test_a_video_that_is_cut_short_is_said_to_be(tmp_path):
     path = film(tmp_path / "orbit.avi")
     content = path.read_bytes()

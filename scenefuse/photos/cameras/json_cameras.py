@@ -117,10 +117,7 @@ def _pose(matrix: Any, where: str) -> NDArray[np.float64]:
         raise StageError(f"{where}: transform_matrix has to be 4 x 4 numbers; export the cameras again")
     if not np.allclose(given[3:], [0, 0, 0, 1]):
         raise StageError(f"{where}: the last row of transform_matrix is not 0 0 0 1; rows and columns may be swapped")
-    pose = np.eye(4)
-    pose[:3] = given[:3]
-    pose[:3, :3] = pose[:3, :3] @ FLIP
-    return pose
+    return np.vstack([given[:3] * [*FLIP.diagonal(), 1.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 def read_opensfm(file: Path) -> dict[str, list[GivenCamera]]:
