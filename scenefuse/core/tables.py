@@ -67,12 +67,8 @@ def read_cells(path: Path) -> list[tuple[int, list[str]]]:
     Raises:
         StageError: the file is missing, or is not text.
     """
-    rows = []
-    for number, line in read_lines(path):
-        cells = _cells(next(_split([line], path)))
-        if cells:
-            rows.append((number, cells))
-    return rows
+    rows = ((number, _cells(next(_split([line], path)))) for number, line in read_lines(path))
+    return [(number, cells) for number, cells in rows if cells]
 
 
 def _split(lines: Iterable[str], path: Path) -> Iterator[list[str]]:
