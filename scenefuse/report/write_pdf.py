@@ -81,7 +81,7 @@ class _Page(FPDF):
         """The project, its maker and the number of the page."""
         self.set_y(-self.l_margin)
         self.set_font("sans", size=7)
-        self.cell(0, 4, shorten(f"{self.project}. {self.made}", 130), align="L")
+        self.cell(0, 4, shorten(f"{self.project}. {self.made}", 110), align="L")
         self.cell(0, 4, f"{self.page_no()}", align="R")
 
     def start(self, name: str, below: str) -> None:
@@ -95,7 +95,7 @@ class _Page(FPDF):
     def text_line(self, text: str, size: int) -> None:
         """A heading of this size."""
         self.set_font("sans", "B", size)
-        self.cell(0, 0.55 * size, text, new_x="LMARGIN", new_y="NEXT")
+        self.multi_cell(0, 0.55 * size, text, align="L", new_x="LMARGIN", new_y="NEXT")
 
     def facts(self, facts: dict[str, str]) -> None:
         """A table of labels and sentences."""
@@ -149,7 +149,9 @@ class _Page(FPDF):
         cell, mm = (self.epw - GAP_MM) / 2, 1000 * metres_per_unit(unit)
         needed = mm * max(width / cell, height / (0.2 * self.eph))
         power = 10.0 ** np.floor(np.log10(needed))
-        scale = max(1, round(next(k for k in (1, 1.5, 2, 2.5, 3, 4, 5, 7.5, 10) if k * power >= needed) * power))
+        scale = next(k for k in (1, 1.5, 2, 2.5, 3, 4, 5, 7.5, 10) if k * power >= needed) * power
+        # Nothing is enlarged that has a size.
+        scale = scale if unit == "scene units" else max(1.0, scale)
         per_unit, top = mm / scale, self.get_y()
         self.set_font("sans", size=8)
         for k, (side, (pixels, pixel)) in enumerate(zip(SIDES, views)):
@@ -165,6 +167,6 @@ class _Page(FPDF):
         self.set_line_width(1)
         self.line(self.l_margin, self.get_y(), self.l_margin + bar * per_unit, self.get_y())
         self.ln(1)
-        ratio = "" if unit == "scene units" else f"1:{scale} on A4; "
+        ratio = "" if unit == "scene units" else f"1:{scale:g} on A4; "
         north = "" if value(known, "has_north") else "; y taken for north"
         self.cell(0, 5, f"{ratio}bar: {length(bar, unit)}; grey: not measured{north}", new_x="LMARGIN", new_y="NEXT")

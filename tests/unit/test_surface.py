@@ -839,6 +839,37 @@ def test_four_sides_on_paper_are_to_the_round_scale_that_is_written_below(placed
     assert scale in {round(k * 10.0**power) for k in (1, 1.5, 2, 2.5, 3, 4, 5, 7.5) for power in range(4)}
 
 
+@pytest.mark.parametrize(
+    ("unit", "pixel", "said"),
+    [("m", 0.001, "1:2.5 on A4; bar: 10.0 cm"), ("scene units", 1e-5, "bar: 0.00100 scene units")],
+)
+def test_four_sides_of_a_small_object_fill_their_place_on_paper_and_no_more(tmp_path: Path, unit, pixel, said):
+    drawings = tmp_path / "shed/drawings"
+    drawings.mkdir(parents=True)
+    pixels = {f"{side}_pixel": quantity(pixel, unit) for side in ("south", "east", "north", "west")}
+    write_json(drawings / "drawings.json", pixels | {"has_north": quantity(True, "")})
+    for name in pixels:
+        Image.new("RGB", (220, 100), "red").save(drawings / f"{name.removesuffix('_pixel')}.tif")
+    (tmp_path / "objects.tsv").write_text("object\tstatus\nshed\tregistered\n")
+    write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")
+    page = pypdfium2.PdfDocument(tmp_path / "r.pdf")[2]
+    (left, *_, right, _), (beside, *_, end, _), *_ = (image.get_bounds() for image in page.get_objects([3]))
+    assert right - left > 200 and right < beside and end < 595
+    assert said in page.get_textpage().get_text_bounded()
+
+
+def test_long_names_do_not_run_off_the_paper(tmp_path: Path):
+    folders = [
+        tmp_path / "the_north_wing_of_the_old_mill_seen_from_the_other_bank_",
+        tmp_path / "THE_SOUTH_WING_OF_THE_OLD_MILL_AS_SEEN_FROM_THE_OTHER_BANK",
+    ]
+    table = "\n".join(["object\tstatus", *(f"{folder.name}\tregistered" for folder in folders)])
+    (tmp_path / "objects.tsv").write_text(table + "\n")
+    write_pdf(summary=tmp_path, objects=tuple(folders), report=tmp_path / "r.pdf")
+    pages = pypdfium2.PdfDocument(tmp_path / "r.pdf")
+    assert max(one.get_bounds()[2] for page in pages for one in page.get_objects()) < 595
+
+
 def test_a_report_on_paper_of_what_failed_says_so(tmp_path: Path):
     (tmp_path / "objects.tsv").write_text("object\tstatus\terror\nshed\tfailed\ttoo little overlap\n")
     (tmp_path / "shed/figures").mkdir(parents=True)
