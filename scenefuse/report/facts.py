@@ -100,9 +100,9 @@ def _surface(has: dict[str, Any]) -> list[str]:
 
 
 def scale_sd(row: Row) -> float:
-    """Relative standard deviation of an object's lengths by its scale and, where that is known, the scene's."""
+    """Relative standard deviation of lengths by the scale, as far as it is known: of a scene, or an object in one."""
     has = _known(row)
-    return math.hypot(has.get("scale_sd_log", 0.0), has.get("scene_scale_sd_log", 0.0))
+    return math.hypot(*(has.get(f"{of}scale_sd_log", 0.0) for of in ("", "scene_", "gps_")))
 
 
 def _plural(unit: str) -> str:

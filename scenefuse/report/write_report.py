@@ -67,6 +67,7 @@ def write_report(
     views = _views([*(folder / "figures" for folder in objects), *scenes])
     tables = {name: table for name in texts["tables"] if len(table := read_table(summary / f"{name}.tsv"))}
     shown = list(zip(objects, rows_of(summary, "object", objects)))
+    flown = list(zip(scenes, rows_of(summary, "scene", scenes)))
     links = "".join(
         f'<span><a href="#{escape(folder.name)}">{escape(folder.name)}</a>{_badge(row)}</span>' for folder, row in shown
     )
@@ -75,10 +76,10 @@ def write_report(
         f"<nav>{links}</nav></header>",
         *(
             f'<section class="scene"><h2>Scene {escape(row["scene"])}</h2>{_facts(scene_facts(row))}</section>'
-            for row in rows_of(summary, "scene", scenes)
+            for _, row in flown
         ),
         *(_object_card(folder, row, views.get(folder / "figures"), texts) for folder, row in shown),
-        *(_scene_card(folder, views.get(folder), texts) for folder in scenes if (folder / "scene.png").is_file()),
+        *(_scene_card(f, row, views.get(f), texts) for f, row in flown if (f / "scene.png").is_file()),
         '<section id="record"><h2>For the record</h2>',
         *(_object_record(folder, texts) for folder, row in shown if row["status"] not in UNFINISHED),
         *(_folded("The paper", p.read_text("utf-8") if p.is_file() else texts["no_paper"]) for p in papers),
@@ -156,11 +157,11 @@ def _slider(figures: Path) -> str:
     return f'<div><div class="slider">{before}{after}</div>{slider}</div>'
 
 
-def _scene_card(folder: Path, view: View | None, texts: Texts) -> str:
+def _scene_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str:
     """A scene with its objects in 3D, and its figure."""
     parts = [f'<section class="card" id="scene-{escape(folder.name)}"><h2>Scene {escape(folder.name)} in pictures</h2>']
     if view is not None:
-        parts.append(view_section(f"scene-{folder.name}", f"scene {folder.name}", view))
+        parts.append(view_section(f"scene-{folder.name}", f"scene {folder.name}", view, scale_sd=scale_sd(row)))
     return "\n".join([*parts, figure(folder / "scene.png", texts["scene_figure"]), "</section>"])
 
 

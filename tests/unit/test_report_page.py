@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.browser import chromium, click, touch
 
 from scenefuse.cloud.clouds import Cloud
@@ -450,6 +451,16 @@ def test_more_views_than_a_page_holds_get_fewer_points_each(tmp_path, monkeypatc
     text = report(tmp_path, {"house": view, "shed": view}).read_text()
     counts = [sum(json.loads(about)["points"].values()) for about in re.findall(r'class="about">(.*?)</script>', text)]
     assert len(counts) == 2 and all(700 < count <= 1000 for count in counts)
+
+
+def test_a_length_is_as_exact_in_the_scene_s_view_as_its_scale(tmp_path):
+    page, yard, view = report(tmp_path, {}), tmp_path / "yard", view_of(grid(), completed(grid(), grid(9, 0.05, 0.4)))
+    yard.mkdir()
+    Image.new("RGB", (40, 30)).save(yard / "scene.png")
+    write_view(yard, view)
+    (tmp_path / "summary/scenes.tsv").write_text("scene\tgps_scale_sd_log\nyard\t0.03\n")
+    write_report(summary=tmp_path / "summary", scenes=(yard,), title="test", report=page)
+    assert json.loads(re.search(r'class="about">(.*?)</script>', page.read_text())[1])["scale_sd"] == 0.03
 
 
 @pytest.mark.slow
