@@ -81,6 +81,12 @@ def bits_to_stretch(photos: list[Photo]) -> int:
     return unused if unused >= MIN_UNUSED_BITS else 0
 
 
+def unused_bits(pixels: NDArray[Any]) -> int:
+    """Leading bits of pixels of 8 or 16 bits that are 0 in all but a few hot ones."""
+    brightest = int(np.quantile(pixels[::4, ::4], 1 - HOT_SHARE, method="lower"))
+    return 8 * pixels.itemsize - max(brightest.bit_length(), 1)
+
+
 def stays(folder: Path, photo: Photo, bits: int) -> bool:
     """Whether a photo's file is used as it is: upright, not to be made brighter, and in a format that COLMAP reads."""
     with open_picture(folder / photo.name) as image:
@@ -96,11 +102,7 @@ def save_upright(folder: Path, photo: Photo, target: Path, bits: int = 0, max_wi
         equivalent_mm = 36.0 * (photo.focal_px or 0.0) / max(photo.width, photo.height)
         focal = {Base.FocalLength: photo.focal_mm, Base.FocalLengthIn35mmFilm: min(round(equivalent_mm), 65535)}
         exif[IFD.Exif] = {tag: number for tag, number in focal.items() if number}
-        upright: Image.Image = image
-        if bits:
-            upright = Image.fromarray(stretched(_pixels(image, path), bits))
-            upright.getexif()[Base.Orientation] = image.getexif().get(Base.Orientation, 1)
-        upright = ImageOps.exif_transpose(upright)
+        upright = ImageOps.exif_transpose(brightened(image, path, bits) if bits else image)
         width, height = upright.size
         if max_width_px is not None and width > max_width_px:
             size = max_width_px, max(round(height * max_width_px / width), 1)
@@ -116,13 +118,20 @@ def save_upright(folder: Path, photo: Photo, target: Path, bits: int = 0, max_wi
     return replace(photo, **seen, focal_px=focal_px, orientation=1, unused_bits=photo.unused_bits - bits)
 
 
+def brightened(image: Image.Image, path: Path, bits: int) -> Image.Image:
+    """A picture, opened by Pillow, its pixels shifted by some bits and 8 of them kept."""
+    brighter = Image.fromarray(stretched(pixels_of(image, path), bits))
+    brighter.getexif()[Base.Orientation] = image.getexif().get(Base.Orientation, 1)
+    return brighter
+
+
 def has_16_bits(path: Path) -> bool:
     """Whether a picture's pixels are of 16 bits; Pillow drops half of those of colours."""
     with open_picture(path) as image:
         return image.mode.startswith("I;16") or ";16" in str(getattr(image, "tile", ""))
 
 
-def _pixels(image: Image.Image, path: Path) -> NDArray[Any]:
+def pixels_of(image: Image.Image, path: Path) -> NDArray[Any]:
     """(H, W) or (H, W, 3) RGB pixels of a picture, opened by Pillow, of 8 or 16 bits: as stored, or as people see them
     where the picture forgets then how it is turned."""
     if image.mode.startswith("I;16"):
@@ -175,8 +184,7 @@ def inspect_photo(folder: Path, name: str) -> Photo:
             raise ValueError("it is a panorama, to which no lens is fitted: cut it into views")
         if image.mode in ("F", "I"):
             raise ValueError("its pixels are 32-bit measurements, as a thermal camera's, and no picture")
-        sample = _pixels(image, folder / name)[::4, ::4]
-        brightest = int(np.quantile(sample, 1 - HOT_SHARE, method="lower"))
+        bits = unused_bits(pixels_of(image, folder / name))
         width, height = image.size
         return Photo(
             name,
@@ -189,7 +197,7 @@ def inspect_photo(folder: Path, name: str) -> Photo:
             orientation=int(orientation) if orientation in range(1, 9) else 1,
             focal_mm=focal_mm or None,
             position_note=note,
-            unused_bits=8 * sample.itemsize - max(brightest.bit_length(), 1),
+            unused_bits=bits,
             **asdict(position),
         )
 

@@ -266,8 +266,7 @@ class Document:
             with atomic_file(self.path.resolve()) as temporary:
                 temporary.write_text(text, encoding="utf-8")
         except OSError as error:
-            message = f"{self.path} cannot be written ({error.strerror}); check its folder's permissions"
-            raise StageError(message) from None
+            raise StageError(f"{self.path} cannot be written ({error.strerror}); correct that, and repeat it") from None
 
 
 def digest(path: Path) -> str:

@@ -119,8 +119,7 @@ class PhotoMap:
     def reach_px(self) -> float:
         """How many pixels of the photo a pointer may miss a click by."""
         picture = self._picture
-        zoom = float(self.widget.zoom)
-        return 0.0 if picture is None else POINTER_PX / picture.scale * 2 ** (picture.depth - zoom)
+        return 0.0 if picture is None else POINTER_PX / picture.scale * 2 ** (picture.depth - float(self.widget.zoom))
 
     def lay(self, name: str, address: str | None) -> None:
         """Lay a mask over the photo in the place of the former one of this name; None takes it away."""

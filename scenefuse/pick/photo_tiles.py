@@ -11,11 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import ImageOps
 
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.photos.frames import sharpness
 from scenefuse.photos.photo_files import open_picture
+from scenefuse.photos.photos import MIN_UNUSED_BITS, brightened, has_16_bits, pixels_of, unused_bits
 
 TILE_PX = 256
 # Longer side of a thumbnail.
@@ -68,7 +69,7 @@ class Picture:
 
 
 def read_upright(path: Path, min_px: int) -> Pixels:
-    """(H, W, 3) uint8 RGB of a photo as people see it.
+    """(H, W, 3) uint8 RGB of a photo as people see it, as bright as the workflow makes photos that use few bits.
 
     Args:
         path: of the photo.
@@ -79,11 +80,9 @@ def read_upright(path: Path, min_px: int) -> Pixels:
     """
     with open_picture(path) as stored:
         stored.draft("RGB", (min_px, min_px))
-        image = ImageOps.exif_transpose(stored)
-        # Sixteen-bit grey is not scaled by Pillow's conversion.
-        if image.mode.startswith("I;16"):
-            image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
-        return np.asarray(image.convert("RGB"))
+        bits = unused_bits(pixels_of(stored, path))
+        image = brightened(stored, path, bits) if bits >= MIN_UNUSED_BITS or has_16_bits(path) else stored
+        return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
 
 
 def at_most(pixels: Pixels, side_px: int) -> Pixels:
@@ -150,7 +149,7 @@ class Thumbnails:
         """
         try:
             key = self._key(picture)
-            if key not in self._known:
+            if key not in self._known or not self._known[key].is_file():
                 pixels = read_upright(picture.path, 2 * THUMBNAIL_PX)
                 sharp = sharpness(np.ascontiguousarray(pixels[..., ::-1]))
                 path = self._folder / f"{key}_{sharp:.2f}.jpg"

@@ -148,3 +148,6 @@ def test_a_file_that_cannot_be_written_is_named_and_the_click_is_not_taken(tmp_p
     with pytest.raises(StageError, match=r"prompts\.tsv"):
         document.change((HEAD,))
     assert document.rows == () and not document.undo()
+    (tmp_path / "config").touch()
+    with pytest.raises(StageError, match=r"prompts\.tsv cannot be written \(File exists\); correct that"):
+        Document(tmp_path / "config/prompts.tsv", "labels").change((HEAD,))
