@@ -106,7 +106,7 @@ def with_normals(cloud: Cloud, views: Sequence[View] = ()) -> Cloud:
         return cloud
     if len(cloud) <= NEIGHBOURS:
         return replace(cloud, normals=np.tile(UP.astype(np.float32), (len(cloud), 1)))
-    normals, some = normals_at(cloud.points, cloud.points), sampled_rows(len(cloud), AT_ONCE, seed=0)
+    normals, some = normals_at(cloud.points, cloud.points), sampled_rows(len(cloud), AT_ONCE // 4, seed=0)
     outward = _outward(cloud.points[some], normals[some], views)
     near = cKDTree(cloud.points[some]).query(cloud.points, workers=threads())[1]
     normals *= np.where((normals * outward[near]).sum(1, keepdims=True) < 0, -1.0, 1.0)
