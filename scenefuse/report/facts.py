@@ -32,6 +32,8 @@ LOOKED_AT = 20
 # Others look before as after.
 ADDED = ("registered", "ungated")
 DONE = (*ADDED, ALONE)
+# Of what shares of an object's surface are: of all of it, where masks say what that is.
+OF_ALL = ("its surface", None)
 # Between the pieces of advice in a cell of objects.tsv.
 BETWEEN = " | "
 # A wider angle without any photo leaves a side of the object unseen.
@@ -59,7 +61,8 @@ def object_facts(row: Row) -> dict[str, str]:
         there, missing, *kinds = _surface(has)
         causes = ", ".join(f"{share} {what}" for what, share in zip(WORDS["missing"].values(), kinds) if share)
         cells = f" (in cells of {length(has['surface_cell'], unit)})" if "surface_cell" in has else ""
-        facts["Surface"] = f"{there} is there{cells}" + (f", {missing} is missing: {causes}" if missing else "")
+        whole = "" if has.get("surface_of") in OF_ALL else f" of {has['surface_of']}"
+        facts["Surface"] = f"{there}{whole} is there{cells}" + (f", {missing} is missing: {causes}" if missing else "")
         if has.get("ground_missing"):
             facts["Surface"] += f"; of the ground at its foot {percent(has['ground_missing'])} is missing"
     if found := accuracies(row):
@@ -90,7 +93,7 @@ def verdict(row: Row) -> str:
 
 def _completed(has: dict[str, Any]) -> str:
     """How much of an object's surface is there, to follow the word "completed"."""
-    known = has["status"] == "registered" and "surface_missing" in has
+    known = has["status"] == "registered" and "surface_missing" in has and has.get("surface_of") in OF_ALL
     return f" to {_surface(has)[0]}" if known else ""
 
 
@@ -168,8 +171,8 @@ def accuracies(row: Row) -> list[str]:
     if has.get("scale_sd_log"):
         found.append(f"its size beside the scene's is known to {percent(has['scale_sd_log'])}")
     for kind, what in WORDS["errors"].items():
-        if f"{kind}_rms_horizontal_m" in has and f"{kind}_rms_vertical_m" in has:
-            found += _errors(what, has[f"{kind}_rms_horizontal_m"], has[f"{kind}_rms_vertical_m"])
+        known = {way: has[name] for way in ("horizontal", "vertical") if (name := f"{kind}_rms_{way}_m") in has}
+        found += _errors(what, known) if known else []
     return found
 
 
@@ -215,16 +218,17 @@ def scene_facts(row: Row) -> dict[str, str]:
     where = crs_name(has["crs"]) if "crs" in has else "in a local frame, without a CRS"
     facts["Coordinates"] = f"{_plural(counted)}, {where}"
     if "latitude_deg" in has:
-        north, east = has["latitude_deg"], has["longitude_deg"]
+        north, east, height = has["latitude_deg"], has["longitude_deg"], has.get("altitude_m")
         place = f"{abs(north):.5f}° {'NS'[north < 0]}, {abs(east):.5f}° {'EW'[east < 0]}"
-        above = f", {has['altitude_m']:,.1f} m" if "altitude_m" in has else ""
-        given = given_place(has)
-        facts["Heights"] = heights_of(has.get("crs"), has.get("control_points"), has.get("altitude_m"), given)
+        above = "" if height is None else f", {height:,.1f} m"
+        facts["Heights"] = heights_of(has.get("crs"), has.get("control_points"), height, given_place(has))
         facts["Local frame"] = f"metres east, north and up from {place}{above}"
     if found := accuracies(row):
         facts["Position"] = f"absolute, where on Earth the scene lies: {found[0]}"
         if not {"check_rms_horizontal_m", "control_rms_horizontal_m"} & has.keys():
             facts["Position"] += f"; {WORDS['common']}"
+    elif "crs" in has:
+        facts["Position"] = f"that of the given {given_place(has) or 'cloud'}; nothing checks it"
     if "length_unit" in has:
         facts["Scale"] = _scale(has)
     if "ground_pixel" in has:
@@ -242,12 +246,12 @@ def _capital(facts: dict[str, str]) -> dict[str, str]:
     return {label: text if label == "File" else text[:1].upper() + text[1:] for label, text in facts.items()}
 
 
-def _errors(what: str, horizontal_m: float, vertical_m: float) -> list[str]:
-    """Root mean square errors, and what 90 % of normal errors in the plane and upwards do not exceed."""
-    ce90 = length(math.sqrt(math.log(10)) * horizontal_m, "m")
-    le90 = length(NormalDist().inv_cdf(0.95) * vertical_m, "m")
-    rms = f"{length(horizontal_m, 'm')} horizontally and {length(vertical_m, 'm')} vertically"
-    return [f"{what} {rms} off (root mean square)", f"nine of ten less than {ce90} (CE90) and {le90} (LE90)"]
+def _errors(what: str, known: dict[str, float]) -> list[str]:
+    """Root mean square errors in metres, and what 90 % of normal ones do not exceed; horizontal, vertical, or both."""
+    most = {"horizontal": (math.sqrt(math.log(10)), "CE90"), "vertical": (NormalDist().inv_cdf(0.95), "LE90")}
+    rms = " and ".join(f"{length(off, 'm')} {way}ly" for way, off in known.items())
+    within = " and ".join(f"{length(most[way][0] * off, 'm')} ({most[way][1]})" for way, off in known.items())
+    return [f"{what} {rms} off (root mean square)", f"nine of ten less than {within}"]
 
 
 def rows_of(summary: Path, kind: str, folders: Sequence[Path]) -> list[dict[str, Any]]:

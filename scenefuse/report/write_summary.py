@@ -137,7 +137,7 @@ def runtime_table(benchmarks: Path, forecast: Mapping[str, float]) -> pd.DataFra
         max_rss_mb=("max_rss_mb", "max"),
     )
     table = table.sort_values("seconds", ascending=False).reset_index()
-    sums = [jobs[name].sum(skipna=False) for name in SECONDS]
+    sums = jobs[[*SECONDS]].sum(skipna=False)
     table.loc[len(table)] = ["total", len(jobs), *sums, jobs["seconds"].max(), jobs["max_rss_mb"].max()]
     return table
 

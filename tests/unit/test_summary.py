@@ -13,7 +13,7 @@ from PIL import Image
 
 from scenefuse.core.job_records import KILLED, NO_LOG, NOT_ACCEPTED, JobRecords, why_ended, why_unfinished
 from scenefuse.core.stage import StageError, quantity, write_json
-from scenefuse.report.facts import closing_lines, object_facts, scene_facts, title_of
+from scenefuse.report.facts import accuracies, closing_lines, object_facts, scene_facts, title_of, verdict
 from scenefuse.report.run_summary import RunInputs
 from scenefuse.report.values import find, flatten, length, load, number, percent, percents, read_table, records
 from scenefuse.report.write_report import write_report
@@ -704,6 +704,28 @@ def test_what_is_completed_in_part_alone_is_not_called_completed():
     assert object_facts(row)["Result"] == "Found in the scene and completed to 8.7 %"
     facts = object_facts(row | {"surface_missing": 1.0, "surface_never_seen": 1.0})
     assert facts["Result"].endswith("completed to 0.0 %") and facts["Surface"].startswith("0.0 % is there, 100.0 %")
+
+
+def test_what_is_there_of_a_cloud_without_masks_is_not_said_of_the_whole_object():
+    row = {"object": "house", "status": "registered", "surface_missing": 0.02, "surface_never_seen": 0.02}
+    row["surface_of"] = "what its own cloud holds"
+    facts = object_facts(row)
+    assert facts["Result"] == "Found in the scene and completed" and verdict(row) == "completed"
+    assert facts["Surface"].startswith("98.0 % of what its own cloud holds is there, 2.0 % is missing")
+    assert object_facts(row | {"surface_of": "its surface"})["Result"].endswith("completed to 98.0 %")
+
+
+def test_a_position_is_as_exact_as_what_is_known_of_it_says():
+    row = {"scene": "yard", "length_unit": "m", "crs": "EPSG:32632"}
+    known = {"control_rms_horizontal_m": 0.02, "gps_rms_horizontal_m": 2.0, "gps_rms_vertical_m": 3.0}
+    position = scene_facts(row | known)["Position"]
+    assert position == "Absolute, where on Earth the scene lies: control points are 20.0 mm horizontally off" + (
+        " (root mean square)"
+    )
+    assert accuracies(row | known)[1] == "nine of ten less than 30.3 mm (CE90)"
+    assert scene_facts(row)["Position"] == "That of the given cloud; nothing checks it"
+    assert scene_facts(row | {"up_cue": "given cameras"})["Position"].startswith("That of the given cameras;")
+    assert "Position" not in scene_facts({"scene": "yard"})
 
 
 def test_the_result_and_the_surface_of_an_object_name_the_same_share():
