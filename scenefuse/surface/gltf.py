@@ -261,8 +261,10 @@ def metres_per_unit(unit: str) -> float:
 def place_of_scene(georeference_json: Path | None) -> dict[str, Any]:
     """What `asset.extras` says of the frame of a scene's surfaces and of its place in the world."""
     known = {} if georeference_json is None else read_json(georeference_json)
+    frame = scene_frame(known)
+    compass = ": x east, z south" if frame is not None and frame.has_north else ""
     content = {
-        "axes": "x east, y up, z south; before that, in the scene, x east, y north, z up",
+        "axes": f"y up; x, y, z here are x, z, -y in the scene{compass}",
         "scene_unit": length_unit(georeference_json),
         "classes": {kind.name.lower(): int(kind) for kind in FaceClass},
     }

@@ -35,7 +35,7 @@ from scenefuse.surface import drawings as drawn
 from scenefuse.surface import texture, tiles
 from scenefuse.surface.cameras import export_cameras
 from scenefuse.surface.drawings import NOTHING, SIDES, draw, draw_surface, facade_axes, wall_turn
-from scenefuse.surface.gltf import Painted, earth_from_scene, write_glb
+from scenefuse.surface.gltf import Painted, earth_from_scene, place_of_scene, write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
 from scenefuse.surface.mesh import FaceClass, Surface, make_mesh
 from scenefuse.surface.texture import beyond_manifold, textured, unfolded
@@ -412,7 +412,9 @@ def test_a_drawing_names_its_day_and_a_plan_its_crs_with_an_arrow_to_the_north(d
 @pytest.mark.slow
 def test_a_plan_has_no_arrow_to_the_north_where_y_points_south_and_of_a_level_facade_one_looks_down(coarse, tmp_path):
     here = {"crs": quantity("EPSG:2048", ""), "origin_in_crs": quantity([1e4, 3.7e6, 300.0], "m")}
-    write_json(tmp_path / "g.json", GEOREFERENCE | here)
+    for known, compass in ((GEOREFERENCE, ": x east, z south"), (GEOREFERENCE | here, "")):
+        write_json(tmp_path / "g.json", known)
+        assert place_of_scene(tmp_path / "g.json")["axes"] == f"y up; x, y, z here are x, z, -y in the scene{compass}"
     level = np.array([[0, 0, 1.0], [0.1, 0, 1], [0, 0.1, 1]])
     folder = ball_drawn(coarse, tmp_path, georeference_json=tmp_path / "g.json", facade=tuple(level.ravel()))
     pages = [page.get_textpage().get_text_bounded() for page in pypdfium2.PdfDocument(folder / "drawings.pdf")]
