@@ -89,6 +89,12 @@ class Clicks:
         """(N, 2) pixels."""
         return np.array([(click.x_px, click.y_px) for click in self.rows]).reshape(-1, 2)
 
+    def check_twice(self) -> None:
+        """Raise StageError where a point or an end is clicked in one photo only, as one is whose name is misspelled."""
+        times = Counter(self.labels)
+        for click in (click for click in self.rows if times[click.label] < 2):
+            raise StageError(f"{self.path}: {click.name} is clicked in {click.photo} only; click it in another one")
+
 
 @dataclass(frozen=True)
 class ScenePoints:
@@ -245,10 +251,9 @@ def _scene_points(path: Path, lines: Lines) -> ScenePoints:
 
 def check_inside(path: Path, click: Click, size: tuple[int, int]) -> None:
     """Raise StageError where a click lies outside its photo of this (width, height)."""
-    width, height = size
-    if not (0 <= click.x_px <= width and 0 <= click.y_px <= height):
+    if not (0 <= click.x_px <= size[0] and 0 <= click.y_px <= size[1]):
         raise StageError(
-            f"{path}: {click} lies outside {click.photo}, which has {width} x {height} pixels; correct the click"
+            f"{path}: {click} lies outside {click.photo}, which has {size[0]} x {size[1]} pixels; correct the click"
         )
 
 
@@ -261,8 +266,8 @@ def check_marks(path: Path, photos: Mapping[str, Path] | None = None, used: list
         used: those of them that will be used; None for all.
 
     Raises:
-        StageError: what `read_points` says; no click inside and no box; half a box; a click in a photo that does not
-            exist, will not be used or cannot be read, or outside its photo.
+        StageError: what `read_points` says; no click inside and no box; half a box; a point in one photo only; a click
+            in a photo that does not exist, will not be used or cannot be read, or outside its photo.
     """
     marked = read_points(path)
     if isinstance(marked, ScenePoints):
@@ -275,6 +280,8 @@ def check_marks(path: Path, photos: Mapping[str, Path] | None = None, used: list
             raise StageError(
                 f"{path}: a box needs two lines, two opposite corners; in {odd[0]} there are {boxes[odd[0]]}"
             )
+    else:
+        marked.check_twice()
     if photos is None:
         return
     names = list(photos) if used is None else used

@@ -123,29 +123,25 @@ def _registered(
     """The clicks in registered photos by label, two or more of each; and what is left out since a photo has no
     camera."""
     found: dict[str, list[Click]] = {}
-    lost: dict[str, list[str]] = {}
+    lost: dict[str, list[Click]] = {}
+    clicks.check_twice()
     for click in in_photos(clicks.rows, [*images, *(sizes or ())], clicks.path):
         own = found.setdefault(click.label, [])
         if click.photo in images:
             own.append(click)
         elif sizes is None or click.photo in sizes:
-            lost.setdefault(click.label, []).append(click.photo)
+            lost.setdefault(click.label, []).append(click)
         else:
             raise StageError(
                 f"{clicks.path}: point {click.name} is clicked in {click.photo}, which is not among the {len(images)}"
                 f" registered photos; click in one of them ({', '.join(sorted(images)[:3])}, ...)"
             )
     left_out, unsure = [], "" if sizes else ", or is none of the photos"
-    names = {click.label: click.name for click in clicks.rows}
-    for label, own in found.items():
-        count = f"the number of registered photos in which point {names[label]} is clicked is {len(own)}"
-        unregistered = f"{', '.join(lost.get(label, []))} could not be registered{unsure}"
-        if len(own) < 2 and label not in lost:
-            raise StageError(f"{clicks.path}: {count}; two or more are needed, click it in another one")
-        if len(own) < 2:
-            left_out.append(f"{count} ({unregistered}), two or more are needed")
-        elif label in lost:
-            left_out.append(f"{unregistered}: its click on point {names[label]}")
+    for label, there in lost.items():
+        unregistered = f"{', '.join(click.photo for click in there)} could not be registered{unsure}"
+        count = f"the number of registered photos in which point {there[0].name} is clicked is {len(found[label])}"
+        few = f"{count} ({unregistered}), two or more are needed"
+        left_out.append(few if len(found[label]) < 2 else f"{unregistered}: its click on point {there[0].name}")
     return {label: own for label, own in found.items() if len(own) > 1}, left_out
 
 
@@ -252,7 +248,7 @@ def read_ends(path: Path) -> Clicks:
     """Read lengths.tsv, where each length has two ends.
 
     Raises:
-        StageError: what `read_length_clicks` says; an end that is missing, or a third one.
+        StageError: what `read_length_clicks` says; an end that is missing, or a third one; one in a single photo.
     """
     clicks = read_length_clicks(path)
     ends: dict[str, list[str]] = {}
@@ -262,4 +258,5 @@ def read_ends(path: Path) -> Clicks:
     odd = next((name for name, two in ends.items() if len(two) != 2), None)
     if odd is not None:
         raise StageError(f"{path}: {odd} has the ends {', '.join(ends[odd])}; click two, each in two photos or more")
+    clicks.check_twice()
     return clicks

@@ -97,7 +97,7 @@ def test_error_sentences_name_the_point(model, tmp_path):
     with pytest.raises(StageError, match=r"point door miss each other by .* px\): 1\.jpg .*, 2\.jpg .*, 3\.jpg"):
         triangulate(with_click(clicks, 3, pixel=clicks.pixels[3] + [0, 60]), model, 5.0)
     single = clicked(model, tmp_path, photos=("2.jpg",))
-    with pytest.raises(StageError, match="in which point roof is clicked is 1; two or more are needed"):
+    with pytest.raises(StageError, match=r"roof is clicked in 2\.jpg only; click it in another one"):
         triangulate(single, model, 5.0)
 
 
@@ -272,9 +272,12 @@ def test_clicks_in_photos_that_will_not_be_there_are_named_before_anything_runs(
         check_marks(path, photos)
     path.write_text("point\tx\ty\tz\na\t1\t2\t3\n")
     check_marks(path, photos)
-    path.write_text("point\tphoto\tx_px\ty_px\na\t9.jpg\t1\t2\n")
+    path.write_text("point\tphoto\tx_px\ty_px\na\t1.jpg\t1\t2\na\t9.jpg\t1\t2\n")
     with pytest.raises(StageError, match=r"the click on a at \(1, 2\) is in 9\.jpg"):
         check_marks(path, photos)
+    path.write_text("point\tphoto\tx_px\ty_px\nroof\t1.jpg\t1\t2\nrof\t2.jpg\t1\t2\n")
+    with pytest.raises(StageError, match=r"roof is clicked in 1\.jpg only"):
+        check_marks(path)
 
 
 def test_a_click_in_a_smaller_copy_that_is_left_out_is_not_taken_for_one_in_its_original(tmp_path):

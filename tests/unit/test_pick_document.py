@@ -42,16 +42,16 @@ def test_each_change_is_in_the_file_at_once_for_the_page_and_for_the_workflow(pa
 
 def test_known_lengths_are_read_back_by_the_page_and_by_the_workflow_one_end_or_two(path):
     document = Document(path, "lengths")
-    first = with_point((), with_length((), "north door 2.05")[1][0], "a b.jpg", 3, 4, {"a b.jpg": (9, 9)})
+    sizes = {"a b.jpg": (9, 9), "c.jpg": (9, 9)}
+    first = with_point((), with_length((), "north door 2.05")[1][0], "a b.jpg", 3, 4, sizes)
     document.change(first)
     again = Document(path, "lengths")
     assert again.rows == first and not again.trouble
-    again.change((*first, Click("north door\t2.05\tb", "a b.jpg", 5, 6)))
+    ends = [Click(f"north door\t2.05\t{end}", photo, 5, 6) for end in "ab" for photo in sizes]
+    again.change((*first, *ends[1:]))
     clicks = read_ends(path)
-    assert clicks.labels == ["north door\t2.05\ta", "north door\t2.05\tb"] and clicks.pixels.tolist() == [
-        [3, 4],
-        [5, 6],
-    ]
+    assert clicks.labels == ["north door\t2.05\ta"] * 2 + ["north door\t2.05\tb"] * 2
+    assert clicks.pixels[:2].tolist() == [[3, 4], [5, 6]]
 
 
 def test_a_file_from_a_spreadsheet_is_edited_with_the_names_that_the_photos_have(path):
