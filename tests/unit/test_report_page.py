@@ -229,6 +229,8 @@ def test_the_surface_is_shown_with_photos_class_and_deviation_beside_the_points(
     clicked = np.array(words[7:], np.float64).reshape(3, 3)
     cloud = np.concatenate([before.points, added.points])
     assert np.linalg.norm(cloud[:, None] - clicked, axis=2).min(0).max() < 1e-3 and len(np.unique(clicked, axis=0)) == 3
+    # A word of a command line that begins with a minus and is no plain number is an option.
+    assert all(re.fullmatch(r"-?\d+(\.\d+)?", word) for word in words[7:]), words
     choose(browser, "Draw a facade")
     assert not browser.find(f"{SECTION} .command").is_displayed()
     choose(browser, "Before")

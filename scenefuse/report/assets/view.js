@@ -327,7 +327,7 @@ class View {
   facade() {
     const { name, middle } = this.about.surface;
     const places = this.picked.map((point) => middle.map((along, axis) => along + point[axis]));
-    const numbers = places.flat().map((x) => Number(x.toPrecision(8))).join(" ");
+    const numbers = places.flat().map((x) => Number(x.toFixed(6))).join(" ");
     this.command.textContent = `scenefuse export --what drawings --object ${name} --facade ${numbers}`;
     this.output.textContent = "Below is the command that draws it.";
   }
