@@ -280,6 +280,17 @@ def test_a_length_between_points_whose_deviations_are_unknown_is_known_to_the_sc
     assert found and float(found[2]) == pytest.approx(0.05 * float(found[1]), rel=0.05), said
 
 
+def test_a_length_in_a_view_of_kilometres_is_no_more_exact_than_the_page_holds_its_ends(opened):
+    script = """
+    const land = [...views.values()].find((v) => v.section.ariaLabel.endsWith("land"));
+    land.picked = [[0, 0, 0], [1.0123, 0, 0]].map((place) => Object.assign(place, { deviation: given[0] }));
+    land.about = { ...land.about, scale_sd: 0 };
+    return land.distance();
+    """
+    # Of 2 km in 65,536 steps: each axis is known to 9 mm.
+    assert [opened.value(script, sd) for sd in (0, 0.001)] == ["1.01 m", "1.012 ± 0.018 m"]
+
+
 def test_dragging_turns_and_the_wheel_zooms_once_the_view_is_in_use(opened):
     stage, first = opened.find(STAGE), opened.picture(STAGE)
     camera = camera_of(opened)

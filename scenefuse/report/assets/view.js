@@ -333,11 +333,12 @@ class View {
   }
 
   distance() {
-    // One standard deviation: of both ends, as far as it is known, and of the scale.
+    // One standard deviation: of both ends, as far as it is known, of the scale, and of positions as this page holds them.
     const length = norm(minus(...this.picked));
-    const spread = Math.hypot(...this.picked.map((point) => point.deviation), this.about.scale_sd * length);
-    if (!(spread > 0)) return `${Number(length.toPrecision(4))} ${this.about.unit}`;
+    const known = Math.hypot(...this.picked.map((point) => point.deviation), this.about.scale_sd * length);
+    const spread = Math.hypot(known, norm(this.about.step) / Math.sqrt(6));
     const decimals = Math.max(0, 1 - Math.floor(Math.log10(spread)));
+    if (!known) return `${Number(Number(length.toPrecision(4)).toFixed(Math.max(0, decimals - 1)))} ${this.about.unit}`;
     const more = this.picked.every((point) => point.deviation) ? "" : " or more";
     return `${length.toFixed(decimals)} ± ${spread.toFixed(decimals)} ${this.about.unit}${more}`;
   }
