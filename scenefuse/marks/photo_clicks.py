@@ -145,7 +145,7 @@ def of_photo(path: Path, photo: str, clicks: list[tuple[Click, Array]]) -> Photo
     """The clicks of one photo with their pixels in a copy of it. Its two box corners are sorted."""
     corners = np.array([pixel for click, pixel in clicks if click.label == "box"]).reshape(-1, 2)
     if len(corners) not in (0, 2) or (len(corners) and (np.ptp(corners, axis=0) < 2).any()):
-        raise StageError(f"{path}: a box in {photo} needs two lines, two opposite corners; there are {len(corners)}")
+        raise StageError(f"{path}: a box in {photo} needs two opposite corners, apart by 2 px; it has {len(corners)}")
     others = [(click, pixel) for click, pixel in clicks if click.label != "box"]
     return PhotoClicks(
         np.array([pixel for _, pixel in others]).reshape(-1, 2),

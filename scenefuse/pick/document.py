@@ -20,6 +20,7 @@ from scenefuse.marks.clicks import (
     read_length_clicks,
     read_points,
 )
+from scenefuse.pick.photo_tiles import MASK_PX
 
 # The two ends of a length that is new.
 ENDS = ("a", "b")
@@ -47,10 +48,11 @@ def with_box(rows: Rows, photo: str, corners: Corners, sizes: Sizes) -> Rows:
     """The rows with a box, cut to the photo, in the place of the photo's former one.
 
     Raises:
-        StageError: next to nothing of it lies in the photo.
+        StageError: next to nothing of it lies in the photo, as of a slip.
     """
     (x0, x1), (y0, y1) = (sorted(min(max(c[k], 0.0), sizes[photo][k]) for c in corners) for k in (0, 1))
-    if min(x1 - x0, y1 - y0) < 1:
+    # Two pixels or more where masks are made.
+    if min(x1 - x0, y1 - y0) < 2 * max(1, max(sizes[photo]) / MASK_PX):
         raise StageError(f"the box in {photo} is too small; drag it around the whole object")
     kept = tuple(row for row in rows if (row.label, row.photo) != ("box", photo))
     return (*kept, _in_photo("box", photo, x0, y0, sizes), _in_photo("box", photo, x1, y1, sizes))

@@ -216,8 +216,7 @@ class Editor:
     """
 
     def __init__(self, table: Table, picture: Picture) -> None:
-        self.table, self.picture = table, picture
-        self.tool = "inside"
+        self.table, self.picture, self.tool = table, picture, "inside"
         self._named: tuple[str, ...] = ()
         self._point = self.points[0] if self.points else ""
 

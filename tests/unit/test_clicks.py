@@ -93,7 +93,7 @@ def test_a_click_in_a_photo_that_is_not_used_is_left_out_where_others_say_what_t
             r"in none\.png, which is not among the photos that are used.*; click in one of the 12",
         ),
         ([("outside", "f00.png", 5, 5)], "holds only clicks outside the object"),
-        ([("box", "f00.png", 5, 5)], r"a box in f00\.png needs two lines, two opposite corners; there are 1"),
+        ([("box", "f00.png", 5, 5)], r"a box in f00\.png needs two opposite corners, apart by 2 px; it has 1"),
         (
             [("inside", "f00.png", 5, 5), ("outside", "f00.png", 5, 5)],
             r"\(5, 5\) in f00\.png is given more than once",

@@ -33,9 +33,10 @@ def test_a_box_is_cut_to_the_photo_and_takes_the_place_of_the_former_one():
     assert rows == (HEAD, Click("box", "a.jpg", 50, 0), Click("box", "a.jpg", 100, 45))
 
 
-def test_a_box_beside_the_photo_is_refused():
+@pytest.mark.parametrize(("corners", "size"), [(((120, 10), (150, 40)), (100, 50)), (((20, 10), (30, 40)), (6000, 50))])
+def test_a_box_beside_the_photo_or_by_a_slip_is_refused(corners, size):
     with pytest.raises(StageError, match="too small"):
-        with_box((), "a.jpg", ((120, 10), (150, 40)), SIZES)
+        with_box((), "a.jpg", corners, {"a.jpg": size})
 
 
 def test_a_point_clicked_again_in_its_photo_moves():
