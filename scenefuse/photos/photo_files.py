@@ -309,7 +309,8 @@ def photos_by_name(wanted: Iterable[str], known: Iterable[str], where: str, mask
     for length, name, photo in claims:
         if _shared_folders(name, photo) == depths[_folder(name)]:
             if photo in found and found[photo][0] == length:
-                raise StageError(f"{where}: {found[photo][1]} and {name} may both be the photo {photo}; {RENAME}")
+                both = f"{found[photo][1]} and {name} may both be the photo {photo}"
+                raise StageError(f"{where}: {both}; write it alike if it is one, or {RENAME}")
             found[photo] = max((length, name), found.get(photo, (0, "")))
     return {name: photo for photo, (_, name) in found.items()}
 
@@ -340,8 +341,7 @@ def _keys(name: str, mask: bool = False) -> list[_Key]:
     keys: list[_Key] = []
     for k in range(len(parts)):
         spelled = "_".join(parts[k:])
-        folded = spelled.casefold()
-        keys += [("spelled", spelled), ("folded", folded), ("stem", "_".join([*folders[k:], stem]))]
+        keys += [("spelled", spelled), ("folded", spelled.casefold()), ("stem", "_".join([*folders[k:], stem]))]
     return keys
 
 

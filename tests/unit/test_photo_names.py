@@ -2,6 +2,7 @@
 
 import json
 import unicodedata
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -191,6 +192,8 @@ def test_clicks_and_positions_are_of_the_photos_that_are_meant(tmp_path):
         "b/IMG_1.JPG",
         "b/IMG_2.JPG",
     ]
+    with pytest.raises(StageError, match=r"img_1\.jpg and IMG_1\.JPG may both be .* write it alike if it is one, or"):
+        in_photos([*clicks.rows, replace(clicks.rows[0], photo="IMG_1.JPG")], ["b/IMG_1.JPG"], clicks.path)
     (tmp_path / "geo.txt").write_text("EPSG:4326\nimg_1 8.5 47.5 400\n")
     first, second = positions_of(["b/IMG_1.JPG", "b/IMG_2.JPG"], read_geo(tmp_path / "geo.txt"), tmp_path / "geo.txt")
     assert first["latitude_deg"] == 47.5 and second["latitude_deg"] is None
