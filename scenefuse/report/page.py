@@ -134,8 +134,8 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
     other = {"color": UNKNOWN_COLOR, "label": "unknown"}
     if view.cloud.colors is not None:
         modes.append({"name": "photo", "button": "Natural", "label": "Natural colours, brightened if all are dark"})
-    codes = sorted(set(view.sources) - {REMOVED})
-    sources = {code: (SOURCE_COLORS[k % len(SOURCE_COLORS)], view.sources[code]) for k, code in enumerate(codes)}
+    tints = zip(sorted(set(view.sources) - {REMOVED}), SOURCE_COLORS + SOURCE_COLORS[1:] * len(view.sources))
+    sources = {code: (tint, view.sources[code]) for code, tint in tints}
     sources[REMOVED] = (REMOVED_COLOR, "scene, removed by fusion")
     modes.append({"name": "source", "button": "Source", "other": other, "entries": _entries(view, "source", sources)})
     evidence = view.cloud.fields.get("evidence", np.zeros(0))

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from support.browser import chromium, click, touch
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import write_json
 from scenefuse.core.transforms import UP
+from scenefuse.report.page import view_section
 from scenefuse.report.view import VIEW_POINTS, View, encode, merge, write_view
 from scenefuse.report.write_report import write_report
 from scenefuse.surface.gltf import BRIDGED_TINT, write_glb
@@ -456,6 +458,15 @@ def test_objects_that_are_not_in_the_scene_have_no_view(tmp_path):
     text = report(tmp_path, {"house": None}, status="unregistered").read_text()
     assert "There is no 3D view, for it was not added to the scene." in text
     assert 'class="view"' not in text and 'id="k3d"' not in text
+
+
+def test_no_object_of_many_has_the_colour_of_its_scene():
+    whole = grid()
+    whole.fields["source"] = np.arange(len(whole)).astype(np.uint16) % 12
+    view = replace(view_of(grid(), whole), sources={k: f"object {k}" for k in range(12)})
+    about = json.loads(re.search(r'class="about">(.*?)</script>', view_section("key", "yard", view))[1])
+    colors = {entry["label"]: entry["color"] for entry in about["modes"][1]["entries"]}
+    assert len(colors) == 12 and list(colors.values()).count(colors["object 0"]) == 1
 
 
 def test_more_views_than_a_page_holds_get_fewer_points_each(tmp_path, monkeypatch):
