@@ -78,7 +78,7 @@ def object_facts(row: Row) -> dict[str, str]:
         taken = f"taken {has['photographed']}" if "photographed" in has else "undated"
         facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used, {taken}"
     folder = f"results/objects/{has['object']}"
-    if "added_points" in has:
+    if status in ADDED and "added_points" in has:
         facts["File"] = f"{folder}/fused.ply with its surroundings (local frame, {_plural(unit)}; for CloudCompare)"
     elif status == ALONE:
         facts["File"] = f"{folder}/object.ply (a frame of its own, {_plural(has.get('unit', 'object units'))})"
