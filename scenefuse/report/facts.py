@@ -307,21 +307,21 @@ def closing_lines(summary: Path) -> str:
     )
 
 
-def photographed(photos_json: Path, folder: Path) -> str | None:
+def photographed(folder: Path, photos: str) -> str | None:
     """The day of some photos by their EXIF, or the first and the last day; None where it is not known.
 
     Args:
-        photos_json: lists them.
-        folder: holds them.
+        folder: of a scene's or an object's results, whose photos.json lists them.
+        photos: the folder in it that holds them.
     """
     try:
-        names = [photo["name"] for photo in read_json(photos_json).get("photos", [])]
+        names = [photo["name"] for photo in read_json(folder / "photos.json").get("photos", [])]
     except StageError:
         return None
     days = set()
     for name in names[:: max(1, len(names) // LOOKED_AT)]:
         try:
-            with open_picture(folder / name) as image:
+            with open_picture(folder / photos / name) as image:
                 exif = image.getexif()
                 taken = exif.get_ifd(IFD.Exif).get(Base.DateTimeOriginal) or exif.get(Base.DateTime)
         except StageError:

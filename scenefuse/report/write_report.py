@@ -175,8 +175,10 @@ def _object_record(folder: Path, texts: Texts) -> str:
 def _table_section(table: pd.DataFrame, title: str, note: str, turned: bool = False) -> str:
     """A table with its note; empty columns are left out; `turned` has a row for each column."""
     table = table.dropna(axis=1, how="all")
+    # A place is said whole: of a latitude four digits leave half a kilometre.
+    places = {n: table[n].map("{:.10g}".format, na_action="ignore") for n in table if n.endswith("itude_deg")}
     if turned:
-        table = table.set_index(table.columns[0]).T.rename_axis(columns=None).reset_index(names="")
+        table = table.assign(**places).set_index(table.columns[0]).T.rename_axis(columns=None).reset_index(names="")
     cells = table.map(lambda cell: number(cell) if cell == cell else "-")
     content = cells.to_html(index=False, border=0).replace("_", "_<wbr>")
     return _folded(title, f'<p>{escape(note)}</p><div class="wide">{content}</div>')

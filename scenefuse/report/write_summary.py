@@ -151,13 +151,11 @@ def scenes_table(scenes: list[SceneSummary], inputs: RunInputs) -> pd.DataFrame:
     """
     rows = []
     for scene, folder, maker in zip(scenes, inputs.scenes, inputs.made_by or [""] * len(scenes), strict=True):
-        fields, added = scene.fields, find(scene.fields, "completed.added_points")
+        fields, by = scene.fields, find(scene.fields, "completed.added_points")
         row: dict[str, Any] = {"scene": scene.name, "made_by": maker or None} | _columns(fields, "scenes")
         if "georeference.length_unit" in fields:
-            row["photographed"] = photographed(folder / "photos.json", folder / "photos")
-            row |= of_cameras(folder / "georeferenced")
-        row["gps_scale_sd_log"] = _scale_sd(fields)
-        row["completed_by"] = None if added is None else ", ".join(added) or "none"
+            row |= {"photographed": photographed(folder, "photos")} | of_cameras(folder / "georeferenced")
+        row |= {"gps_scale_sd_log": _scale_sd(fields), "completed_by": None if by is None else ", ".join(by) or "none"}
         for key, entry in fields.items():
             if key.startswith("truth.") and isinstance(entry["value"], (int, float)):
                 row[key.removeprefix("truth.")] = entry["value"]
@@ -188,7 +186,7 @@ def objects_table(run: RunSummary, inputs: RunInputs) -> pd.DataFrame:
             | {"unit": unit or unit_of(fields, "crop.diagonal") or find(fields, "sparse.length_unit")}
             | {"scene": scene or None, "crs": find(scenes.get(scene, {}), "georeference.crs")}
             | {"scene_scale_sd_log": _scale_sd(scenes.get(scene, {}))}
-            | {"photographed": photographed(folder / "photos.json", folder / "frames")}
+            | {"photographed": photographed(folder, "frames")}
             | {"missing": item.missing or None, "error": why_missing(item.failed) if item.missing else None}
             | {"advice": BETWEEN.join(diagnose(item)) or None}
         )

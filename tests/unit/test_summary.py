@@ -166,6 +166,9 @@ def test_counts_and_places_are_written_whole_beside_a_scene_without_any(results)
     write_summary(run=run, summary=results / "summary")
     row = (results / "summary/scenes.tsv").read_text().splitlines()[1].split("\t")
     assert "1234567891" in row and "-122.12346" in row
+    write_report(summary=results / "summary", title="x", report=results / "report.html")
+    page = (results / "report.html").read_text()
+    assert "<td>1234567891</td>" in page and "<td>-122.12346</td>" in page
 
 
 def test_a_refused_pose_says_neither_how_large_an_object_is_nor_how_well_that_is_known(results):
