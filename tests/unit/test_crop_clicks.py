@@ -202,7 +202,7 @@ def test_a_click_in_a_scene_photo_without_a_camera_is_left_out_and_named(crop, m
     [
         (inside((900.0, 10.0)), r"lies outside drone 1\.jpg, which has 800 x 600"),
         ([("outside", (400.0, 300.0))], "holds only clicks outside"),
-        ([("box", (400.0, 300.0))], "a box in drone 1.jpg needs two lines"),
+        ([("box", (400.0, 300.0))], "a box in drone 1.jpg needs two opposite corners"),
     ],
 )
 def test_bad_clicks_in_the_scene_are_one_sentence(crop, rows, sentence):
