@@ -328,8 +328,10 @@ def test_everything_is_named_and_reached_by_the_keyboard(opened):
 
 
 @pytest.mark.process
-def test_a_phone_shows_turns_and_measures_without_scrolling_sideways(page):
+def test_a_phone_shows_turns_and_measures_without_scrolling_sideways(page, tmp_path):
     with chromium(phone=True) as phone:
+        phone.open(report(tmp_path, {"the_north_wing_of_the_old_mill_seen_from_the_other_bank_of_it": None}))
+        assert phone.value("return [innerWidth, document.documentElement.scrollWidth];") == [390, 390]
         phone.open(page)
         ready(phone)
         phone.value("const n = document.querySelector('nav'); n.innerHTML += Array(6).fill(n.innerHTML).join('');")
