@@ -13,7 +13,6 @@ from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.photos.frames import video_size
 from scenefuse.photos.photo_files import open_picture, photo_files, subtitles, thin_out, upright_size
 from scenefuse.report.values import bytes_in, size_text
-from scenefuse.sfm.matches import MatchSettings
 
 # Bytes that a feature takes in both databases of a model, with its matches; a pixel of a photo in its copies as JPEG; a
 # pixel of a scene's depth, normal and confidence maps, with its share of the clouds; a pixel of an object's maps of
@@ -144,6 +143,8 @@ def job_seconds(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) 
 
 def _pairs(photos: Photos, matches: Mapping[str, Any]) -> float:
     """How many pairs of photos are compared; of neighbours, more than half are mutual."""
+    from scenefuse.sfm.matches import MatchSettings  # loads COLMAP and Numba
+
     choice, every = MatchSettings(**matches), photos.count * (photos.count - 1) / 2
     by_gps = photos.with_gps and choice.pairs in ("auto", "spatial") and photos.count >= choice.spatial_from
     if not by_gps and (choice.pairs == "exhaustive" or photos.count <= choice.exhaustive_up_to):

@@ -1,4 +1,4 @@
-"""Snakemake run by tests: plans in a forked copy of this process, which has imported it; runs in processes."""
+"""Snakemake run by tests in a forked copy of this process, which has imported it."""
 
 import os
 import subprocess
@@ -9,21 +9,11 @@ from pathlib import Path
 from snakemake.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
-PLANS = {"-n", "--dry-run", "--summary", "--touch", "--unlock", "--cleanup-metadata"}
-"""Words with which Snakemake starts no job."""
 
 
 def run_snakemake(cwd: Path, *words: object) -> subprocess.CompletedProcess[str]:
     """The finished process, with all its output in `stdout`."""
     arguments = [str(word) for word in words]
-    if PLANS & set(arguments):
-        return _forked(cwd, arguments)
-    env = os.environ | {"COLUMNS": "200", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "snakemake", *arguments]
-    return subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=cwd, env=env)
-
-
-def _forked(cwd: Path, arguments: list[str]) -> subprocess.CompletedProcess[str]:
     with tempfile.TemporaryFile() as output:
         child = os.fork()
         if child == 0:
@@ -32,7 +22,7 @@ def _forked(cwd: Path, arguments: list[str]) -> subprocess.CompletedProcess[str]
                 for stream in (1, 2):
                     os.dup2(output.fileno(), stream)
                 sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", buffering=1)
-                os.environ["COLUMNS"] = "200"
+                os.environ |= {"COLUMNS": "200", "PYTHONPATH": str(ROOT)}
                 os.chdir(cwd)
                 main(arguments)
             except SystemExit as end:
