@@ -123,14 +123,16 @@ def _scale(has: dict[str, Any]) -> str:
     """Whether a scene's lengths can be trusted, and what gives them."""
     if has.get("length_unit", "scene units") == "scene units":
         return "do not trust it: nothing gives it, and lengths are in scene units"
-    if has.get("control_points"):
-        return f"trust it as far as the {has['control_points']:.0f} control points that give it (see Position)"
-    if "gps_scale_sd_log" in has:
-        return f"{_trust(has['gps_scale_sd_log'], has['length_unit'])}, by the photos' GPS"
     given, count = given_place(has), has.get("lengths", 0)
+    disagree = f"{count:.0f} known lengths disagree" if count > 1 else "one known length disagrees"
+    off = percent(has.get("length_rms_pct", 0.0) / 100)
+    beside = f"; {disagree} by {off}" if count else ""
+    if has.get("control_points"):
+        return f"trust it as far as the {has['control_points']:.0f} control points that give it (see Position){beside}"
+    if "gps_scale_sd_log" in has:
+        return f"{_trust(has['gps_scale_sd_log'], has['length_unit'])}, by the photos' GPS{beside}"
     if count > (not given):
-        disagree = f"{count:.0f} known lengths disagree" if count > 1 else "one known length disagrees"
-        return f"trust it to {percent(has['length_rms_pct'] / 100)}, by which {disagree}"
+        return f"trust it to {off}, by which {disagree}"
     source = "one known length" if count else f"the given {given or 'cloud'}"
     return f"it is that of {source}; nothing checks it"
 

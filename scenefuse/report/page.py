@@ -63,8 +63,7 @@ def webp(image: Image.Image) -> str:
 
 def figure(path: Path, caption: str) -> str:
     """A picture with its caption."""
-    picture = embedded(path, caption)
-    return f'<figure class="sheet">{picture}<figcaption>{escape(caption)}</figcaption></figure>'
+    return f'<figure class="sheet">{embedded(path, caption)}<figcaption>{escape(caption)}</figcaption></figure>'
 
 
 def view_section(key: str, name: str, view: View, mesh: ViewMesh | None = None, scale_sd: float = 0.0) -> str:

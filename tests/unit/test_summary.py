@@ -641,6 +641,16 @@ def test_an_object_says_when_it_was_photographed_and_how_its_lengths_follow_from
         ({"lengths": 3, "length_rms_pct": 0.4}, "Trust it to 0.4 %, by which 3 known lengths disagree"),
         ({"control_points": 5, "gps_scale_sd_log": 0.02}, "Trust it as far as the 5 control points that give it"),
         ({"gps_scale_sd_log": 0.02}, "Trust it to 2.0 %, 20.0 cm on a 10 m wall (standard deviation), by the photos'"),
+        # Known lengths beside what gives the scale are its one independent check.
+        (
+            {"gps_scale_sd_log": 0.003, "lengths": 3, "length_rms_pct": 5.2},
+            "Trust it to 0.3 %, 30.0 mm on a 10 m wall (standard deviation), by the photos' GPS;"
+            " 3 known lengths disagree by 5.2 %",
+        ),
+        (
+            {"control_points": 5, "lengths": 1, "length_rms_pct": 5.2},
+            "Trust it as far as the 5 control points that give it (see Position); one known length disagrees by 5.2 %",
+        ),
     ],
 )
 def test_whether_the_scale_can_be_trusted_has_one_answer(known, answer):
