@@ -321,7 +321,7 @@ def photographed(folder: Path, photos: str) -> str | None:
     except StageError:
         return None
     days = set()
-    for name in names[:: max(1, len(names) // LOOKED_AT)]:
+    for name in {*names[:: max(1, len(names) // LOOKED_AT)], *names[-1:]}:
         try:
             with open_picture(folder / photos / name) as image:
                 exif = image.getexif()

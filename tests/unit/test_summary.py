@@ -13,7 +13,7 @@ from PIL import Image
 
 from scenefuse.core.job_records import KILLED, NO_LOG, NOT_ACCEPTED, JobRecords, why_ended, why_unfinished
 from scenefuse.core.stage import StageError, quantity, write_json
-from scenefuse.report.facts import accuracies, closing_lines, object_facts, scene_facts, title_of, verdict
+from scenefuse.report.facts import accuracies, closing_lines, object_facts, photographed, scene_facts, title_of, verdict
 from scenefuse.report.run_summary import RunInputs
 from scenefuse.report.values import find, flatten, length, load, number, percent, percents, read_table, records
 from scenefuse.report.write_report import write_report
@@ -682,6 +682,16 @@ def test_shares_and_lengths_are_written_as_people_do():
     ]
     lengths = [(0.0072, "m"), (0.256, "m"), (11.42, "m"), (0.5, "scene units"), (1234.5, "m")]
     assert [length(*given) for given in lengths] == ["7.20 mm", "25.6 cm", "11.4 m", "0.500 scene units", "1,234 m"]
+
+
+def test_the_day_of_the_last_photos_is_not_passed_over(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for k in range(60):
+        exif = Image.Exif()
+        exif[0x0132] = f"2024:06:0{1 + (k > 57)} 09:30:00"
+        Image.new("RGB", (8, 6)).save(tmp_path / f"photos/{k:02d}.jpg", exif=exif)
+    write_json(tmp_path / "photos.json", {"photos": [{"name": f"{k:02d}.jpg"} for k in range(60)]})
+    assert photographed(tmp_path, "photos") == "2024-06-01 to 2024-06-02"
 
 
 def test_photos_without_a_date_are_called_undated():
