@@ -212,7 +212,7 @@ def summarise_object(
             prefix = f"truth.variants.{variant}."
             fields |= {f"truth.{k.removeprefix(prefix)}": v for k, v in truth.items() if k.startswith(prefix)}
     unit = registered[variants[0]].get("crop.diagonal", {}).get("unit", "scene units")
-    registered = {variant: _in_unit(fields, unit) for variant, fields in registered.items()}
+    stages, registered = _in_unit(stages, unit), {v: _in_unit(fields, unit) for v, fields in registered.items()}
     failed = _why(folder / missing, jobs, who) if missing else ""
     return ObjectSummary(folder.name, stages, registered, fusion, missing, failed, failed_variants, not scene)
 
