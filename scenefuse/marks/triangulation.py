@@ -224,10 +224,9 @@ def read_lengths(path: Path, model: pycolmap.Reconstruction, sizes: Mapping[str,
     """
     clicks = read_ends(path)
     limit_px = MAX_CLICK_MISS * max(max(camera.width, camera.height) for camera in model.cameras.values())
-    labels, places, _ = triangulate(clicks, model, limit_px, sizes)
     metres: dict[str, float] = {}
     ends: dict[str, list[Array]] = {}
-    for label, place in zip(labels, places):
+    for label, place in zip(*triangulate(clicks, model, limit_px, sizes)[:2]):
         name, long, _ = label.split("\t")
         metres[name] = float(long)
         ends.setdefault(name, []).append(place)
@@ -240,7 +239,8 @@ def read_lengths(path: Path, model: pycolmap.Reconstruction, sizes: Mapping[str,
     off = found.scale * in_model / found.metres - 1
     if np.abs(off).max() > MAX_LENGTH_ERROR:
         each = ", ".join(f"{name} {100 * o:+.1f} %" for name, o in zip(metres, off))
-        raise StageError(f"{path}: the lengths contradict each other: off one scale by {each}; correct the wrong one")
+        advice = "correct the wrong one, or click its ends in photos from farther apart"
+        raise StageError(f"{path}: the lengths contradict each other: off one scale by {each}; {advice}")
     return found
 
 
