@@ -28,7 +28,7 @@ from scenefuse.pick.expected_place import Cameras
 from scenefuse.pick.photo_tiles import Picture
 
 FEW_FEATURES = "Needed only where the photos of object and scene share too few features. "
-LENGTH = "Write the name and metres of a length that you know, and click both ends in two photos or more, taken far apart."
+LENGTH = "Write the name and metres of a length that you know, and click both ends in two photos or more, far apart."
 # What to do, by the column that names the table and its kind.
 ADVICE: dict[tuple[str, Kind], str] = {
     ("prompts", "labels"): "Click each part of the object in one photo, about five times. Where the mask holds more,"

@@ -534,7 +534,10 @@ def test_known_lengths_bring_an_object_s_model_into_metres(tmp_path, model):
 @pytest.mark.parametrize(
     "spoil, words",
     [
-        (lambda cells: [cells[0], "2.0" if cells[0] == "door" else cells[1], *cells[2:]], "contradict each other.* farther apart"),
+        (
+            lambda cells: [cells[0], "2.0" if cells[0] == "door" else cells[1], *cells[2:]],
+            "contradict each other.* apart",
+        ),
         (lambda cells: [cells[0], "-1", *cells[2:]], "one positive length"),
         (lambda cells: [*cells[:2], "a", *cells[3:]], "has the ends a"),
         (lambda cells: [*cells[:3], "none.jpg", *cells[4:]], "none.jpg, which is not among"),
