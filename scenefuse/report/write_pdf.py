@@ -99,7 +99,8 @@ class _Page(FPDF):
 
     def facts(self, facts: dict[str, str]) -> None:
         """A table of labels and sentences."""
-        self.rows([list(pair) for pair in facts.items()], (1, 5))
+        # A row has to fit on a page: the last line of a log may hold a command with thousands of files.
+        self.rows([[label, text[:4000] + " ..." * (len(text) > 4000)] for label, text in facts.items()], (1, 5))
 
     def rows(self, rows: list[list[str]], widths: tuple[int, ...]) -> None:
         """A table without a heading."""

@@ -872,8 +872,9 @@ def test_long_names_do_not_run_off_the_paper(tmp_path: Path):
     assert max(one.get_bounds()[2] for page in pages for one in page.get_objects()) < 595
 
 
-def test_a_report_on_paper_of_what_failed_says_so(tmp_path: Path):
-    (tmp_path / "objects.tsv").write_text("object\tstatus\terror\nshed\tfailed\ttoo little overlap\n")
+@pytest.mark.parametrize("command", ["", " 0123.jpg" * 2000])
+def test_a_report_on_paper_of_what_failed_says_so(tmp_path: Path, command):
+    (tmp_path / "objects.tsv").write_text(f"object\tstatus\terror\nshed\tfailed\ttoo little overlap{command}\n")
     (tmp_path / "shed/figures").mkdir(parents=True)
     Image.new("RGB", (400, 300)).save(tmp_path / "shed/figures/before.png")
     write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")
@@ -888,8 +889,11 @@ def test_pictures_below_a_long_text_on_paper_go_on_on_a_new_page(tmp_path: Path)
     (tmp_path / "shed/figures").mkdir(parents=True)
     for name in ("before", "after"):
         Image.new("RGB", (400, 300)).save(tmp_path / f"shed/figures/{name}.png")
-    for words in range(480, 600, 15):
-        (tmp_path / "objects.tsv").write_text(f"object\tstatus\tadvice\nshed\tregistered\t{'overlap ' * words}\n")
+    known = {"unit": "m", "length": 3, "width": 2, "height": 1, "frames": 9, "registered": 9, "added_points": 5}
+    known |= {"scale_sd_log": 0.01, "world_deviation": 0.01, "surface_missing": 0.1, "surface_never_seen": 0.1}
+    for words in range(380, 500, 15):
+        row = {"object": "shed", "status": "registered", "advice": "overlap " * words} | known
+        (tmp_path / "objects.tsv").write_text("\n".join("\t".join(map(str, part)) for part in (row, row.values())))
         write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")
         images = [one for page in pypdfium2.PdfDocument(tmp_path / "r.pdf") for one in page.get_objects([3])]
         assert len(images) == 2 and all(top - low > 40 for _, low, _, top in (image.get_bounds() for image in images))
