@@ -235,8 +235,7 @@ def _registrations(folder: Path, variants: list[str]) -> tuple[dict[str, Fields]
 
 def is_added(folder: Path) -> bool:
     """Whether an object of these results was added to its scene; one that was refused leaves the scene as it is."""
-    status = find(read_fields(folder, ["fusion.json"]), "fusion.status")
-    return (folder / "fused.ply").is_file() and status != "unregistered"
+    return (folder / "fused.ply").is_file() and find(load(folder / "fusion.json"), "status") != "unregistered"
 
 
 def unbroken(folder: Path, names: Sequence[str]) -> tuple[list[str], str]:
