@@ -116,7 +116,7 @@ def georeference_report(found: Georeference, left: Residuals, cue: str) -> dict[
         "scale": quantity(transform.scale, f"{unit} per unit of the sparse model"),
         "up_cue": quantity(cue if placement.levelled else measured_by, ""),
     }
-    content |= {} if left.lengths is None else _of_lengths(left.lengths)
+    content |= {} if left.lengths is None else _of_lengths(left.lengths, placement.status == "scaled")
     if found.placement.status != "georeferenced" or found.frame is None:
         return content
     frame, crs_from_local = found.frame, found.frame.crs_from_local()
@@ -137,14 +137,16 @@ def georeference_report(found: Georeference, left: Residuals, cue: str) -> dict[
     return content | (_of_cameras(found, left) if len(placement.inliers) else {})
 
 
-def _of_lengths(lengths: Lengths) -> dict[str, Any]:
-    """Errors of known lengths, as quantities."""
+def _of_lengths(lengths: Lengths, used: bool) -> dict[str, Any]:
+    """Errors of known lengths, as quantities, and what they leave open of the scale where they give it."""
     error = lengths.in_model - lengths.metres
     content = {
         "lengths": quantity(len(error), "1"),
         "length_rms_m": quantity(rms(error[:, None]), "m"),
         "length_rms_pct": quantity(100 * (rms(error[:, None] / lengths.metres[:, None]) or 0.0), "%"),
     }
+    if used:
+        content["lengths_scale_sd_log"] = quantity(lengths.scale_sd_log, "1")
     print(f"{len(error)} known lengths: RMS {content['length_rms_m']['value']:.4f} m", flush=True)
     return content
 

@@ -186,6 +186,15 @@ def intersect(images: list[pycolmap.Image], pixels: Array) -> tuple[Array | None
     return position, float(np.sqrt(((np.array(reprojected) - pixels) ** 2).sum(1).mean()))
 
 
+def _covariance(images: list[pycolmap.Image], position: Array) -> Array:
+    """(3, 3) of a point (3,) that is clicked in images, each click one pixel off along each axis."""
+    step = 1e-4 * float(np.linalg.norm(images[0].projection_center() - position))
+    around = position + step * np.concatenate([np.eye(3), -np.eye(3)])
+    pixels = np.array([[image.project_point(place) for place in around] for image in images])
+    slope = ((pixels[:, :3] - pixels[:, 3:]) / (2 * step)).transpose(0, 2, 1).reshape(-1, 3)
+    return np.linalg.inv(slope.T @ slope)
+
+
 @dataclass(frozen=True)
 class Lengths:
     """Known lengths in a model.
@@ -194,16 +203,23 @@ class Lengths:
         names: of L lengths.
         metres: (L,) how long they are.
         in_model: (L,) how long they are in the model.
+        sd: (L,) standard deviations of these, by the clicks on their ends.
     """
 
     names: list[str]
     metres: Array
     in_model: Array
+    sd: Array
 
     @property
     def scale(self) -> float:
         """Metres in a unit of the model, by least squares."""
         return float(self.metres @ self.in_model / (self.in_model @ self.in_model))
+
+    @property
+    def scale_sd_log(self) -> float:
+        """Standard deviation of the scale's logarithm, by the clicks."""
+        return float(np.linalg.norm(self.in_model * self.sd) / (self.in_model @ self.in_model))
 
     @property
     def off_m(self) -> Array:
@@ -226,16 +242,26 @@ def read_lengths(path: Path, model: pycolmap.Reconstruction, sizes: Mapping[str,
     limit_px = MAX_CLICK_MISS * max(max(camera.width, camera.height) for camera in model.cameras.values())
     metres: dict[str, float] = {}
     ends: dict[str, list[Array]] = {}
-    for label, place in zip(*triangulate(clicks, model, limit_px, sizes)[:2]):
+    spread: dict[str, Array] = {}
+    labels, places, residuals = triangulate(clicks, model, limit_px, sizes)
+    images = images_by_name(model)
+    seen = [[images[click.photo] for click in own] for own in _registered(clicks, images, sizes)[0].values()]
+    counts = np.array([len(own) for own in seen])
+    # As far as the clicks on an end miss each other, and at least a pixel.
+    click_px = max(1.0, float(np.sqrt((counts * residuals**2).sum() / (2 * counts - 3).sum())))
+    for label, place, own in zip(labels, places, seen):
         name, long, _ = label.split("\t")
         metres[name] = float(long)
         ends.setdefault(name, []).append(place)
-    in_model = np.array([np.linalg.norm(np.subtract(*two)) for two in ends.values()])
+        spread[name] = spread.get(name, 0.0) + click_px**2 * _covariance(own, place)
+    apart = np.array([np.subtract(*two) for two in ends.values()])
+    in_model = np.linalg.norm(apart, axis=1)
     if not (in_model > 0).all():
         raise StageError(
             f"{path}: both ends of {list(metres)[int(in_model.argmin())]} lie at one place; click them again"
         )
-    found = Lengths(list(metres), np.array(list(metres.values())), in_model)
+    sd = np.sqrt(np.einsum("ni,nij,nj->n", apart, np.array(list(spread.values())), apart)) / in_model
+    found = Lengths(list(metres), np.array(list(metres.values())), in_model, sd)
     off = found.scale * in_model / found.metres - 1
     if np.abs(off).max() > MAX_LENGTH_ERROR:
         each = ", ".join(f"{name} {100 * o:+.1f} %" for name, o in zip(metres, off))

@@ -105,7 +105,7 @@ def _surface(has: dict[str, Any]) -> list[str]:
 def scale_sd(row: Row) -> float:
     """Relative standard deviation of lengths by the scale, as far as it is known: of a scene, or an object in one."""
     has = _known(row)
-    return math.hypot(*(has.get(f"{of}scale_sd_log", 0.0) for of in ("", "scene_", "gps_")))
+    return math.hypot(*(has.get(f"{of}scale_sd_log", 0.0) for of in ("", "scene_", "gps_", "lengths_")))
 
 
 def _plural(unit: str) -> str:
@@ -123,18 +123,17 @@ def _scale(has: dict[str, Any]) -> str:
     """Whether a scene's lengths can be trusted, and what gives them."""
     if has.get("length_unit", "scene units") == "scene units":
         return "do not trust it: nothing gives it, and lengths are in scene units"
-    given, count = given_place(has), has.get("lengths", 0)
-    disagree = f"{count:.0f} known lengths disagree" if count > 1 else "one known length disagrees"
-    off = percent(has.get("length_rms_pct", 0.0) / 100)
-    beside = f"; {disagree} by {off}" if count else ""
+    count, off = has.get("lengths", 0), percent(has.get("length_rms_pct", 0.0) / 100)
+    known, disagree = ("one known length", "disagrees") if count == 1 else (f"{count:.0f} known lengths", "disagree")
+    beside = f"; {known} {disagree} by {off}" if count else ""
     if has.get("control_points"):
         return f"trust it as far as the {has['control_points']:.0f} control points that give it (see Position){beside}"
     if "gps_scale_sd_log" in has:
         return f"{_trust(has['gps_scale_sd_log'], has['length_unit'])}, by the photos' GPS{beside}"
-    if count > (not given):
-        return f"trust it to {off}, by which {disagree}"
-    source = "one known length" if count else f"the given {given or 'cloud'}"
-    return f"it is that of {source}; nothing checks it"
+    if "lengths_scale_sd_log" in has:
+        check = f"they disagree by {off}" if count > 1 else "nothing checks it"
+        return f"{_trust(has['lengths_scale_sd_log'], 'm')}, by {known}; {check}"
+    return f"it is that of the given {given_place(has) or 'cloud'}{beside or '; nothing checks it'}"
 
 
 def is_current(made: Path, source: Path) -> bool:

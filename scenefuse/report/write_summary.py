@@ -155,7 +155,7 @@ def scenes_table(scenes: list[SceneSummary], inputs: RunInputs) -> pd.DataFrame:
         row: dict[str, Any] = {"scene": scene.name, "made_by": maker or None} | _columns(fields, "scenes")
         if "georeference.length_unit" in fields:
             row |= {"photographed": photographed(folder, "photos")} | of_cameras(folder / "georeferenced")
-        row |= {"gps_scale_sd_log": _scale_sd(fields), "completed_by": None if by is None else ", ".join(by) or "none"}
+        row |= _scale_sd(fields) | {"completed_by": None if by is None else ", ".join(by) or "none"}
         for key, entry in fields.items():
             if key.startswith("truth.") and isinstance(entry["value"], (int, float)):
                 row[key.removeprefix("truth.")] = entry["value"]
@@ -163,10 +163,11 @@ def scenes_table(scenes: list[SceneSummary], inputs: RunInputs) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _scale_sd(scene: Fields) -> float | None:
-    """How well the photos' GPS gives a scene's scale; None where nothing, control points or a given cloud give it."""
-    others = {"georeference.control_points", "georeference.met_share"}
-    return None if others & set(scene) else find(scene, "georeference.gps_scale_sd_log")
+def _scale_sd(scene: Fields) -> dict[str, float | None]:
+    """How well the photos' GPS or known lengths give a scene's scale; None where others or nothing give it."""
+    others = {"georeference.control_points", "georeference.met_share"} & set(scene)
+    names = ("gps_scale_sd_log", "lengths_scale_sd_log")
+    return {name: None if others else find(scene, f"georeference.{name}") for name in names}
 
 
 def objects_table(run: RunSummary, inputs: RunInputs) -> pd.DataFrame:
@@ -185,7 +186,7 @@ def objects_table(run: RunSummary, inputs: RunInputs) -> pd.DataFrame:
             | _columns(fields, "objects")
             | {"unit": unit or unit_of(fields, "crop.diagonal") or find(fields, "sparse.length_unit")}
             | {"scene": scene or None, "crs": find(scenes.get(scene, {}), "georeference.crs")}
-            | {"scene_scale_sd_log": _scale_sd(scenes.get(scene, {}))}
+            | {"scene_scale_sd_log": next(filter(None, _scale_sd(scenes.get(scene, {})).values()), None)}
             | {"photographed": photographed(folder, "frames")}
             | {"missing": item.missing or None, "error": why_missing(item.failed) if item.missing else None}
             | {"advice": BETWEEN.join(diagnose(item)) or None}

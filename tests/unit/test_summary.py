@@ -633,13 +633,19 @@ def test_an_object_says_when_it_was_photographed_and_how_its_lengths_follow_from
     [
         ({}, "Do not trust it: nothing gives it, and lengths are in scene units"),
         ({"length_unit": "m"}, "It is that of the given cloud; nothing checks it"),
-        ({"length_unit": "m", "lengths": 1}, "It is that of one known length; nothing checks it"),
+        (
+            {"lengths": 1, "lengths_scale_sd_log": 0.03},
+            "Trust it to 3.0 %, 30.0 cm on a 10 m wall (standard deviation), by one known length; nothing checks it",
+        ),
         ({"length_unit": "m", "up_cue": "given cameras"}, "It is that of the given cameras; nothing checks it"),
         (
             {"length_unit": "m", "met_share": 0.7, "lengths": 1, "length_rms_pct": 0.4},
-            "Trust it to 0.4 %, by which one known length disagrees",
+            "It is that of the given cloud; one known length disagrees by 0.4 %",
         ),
-        ({"lengths": 3, "length_rms_pct": 0.4}, "Trust it to 0.4 %, by which 3 known lengths disagree"),
+        (
+            {"lengths": 3, "length_rms_pct": 0.4, "lengths_scale_sd_log": 0.002},
+            "Trust it to 0.2 %, 20.0 mm on a 10 m wall (standard deviation), by 3 known lengths; they disagree by",
+        ),
         ({"control_points": 5, "gps_scale_sd_log": 0.02}, "Trust it as far as the 5 control points that give it"),
         ({"gps_scale_sd_log": 0.02}, "Trust it to 2.0 %, 20.0 cm on a 10 m wall (standard deviation), by the photos'"),
         # Known lengths beside what gives the scale are its one independent check.

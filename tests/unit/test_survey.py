@@ -15,6 +15,7 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.georef.control import read_control
 from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.placement import GeoreferenceSettings
+from scenefuse.marks.triangulation import read_lengths
 from scenefuse.photos.frames import VideoSettings, list_photos
 from scenefuse.photos.geodesy import frame_notes, scene_frame
 from scenefuse.photos.photos import gps_accuracies, read_photos
@@ -508,14 +509,29 @@ def test_known_lengths_give_metres_without_gps(tmp_path, model):
     path.write_text("\n".join(length_lines()) + "\n")
     report, found, rows = georeferenced(tmp_path, model, without_gps(), lengths=path)
     assert (value(report, "status"), value(report, "length_unit")) == ("scaled", "m") and "crs" not in report
-    assert value(report, "length_rms_pct") < 0.5
+    assert value(report, "length_rms_pct") < 0.5 and 0 < value(report, "lengths_scale_sd_log") < 0.02
     assert rows["door"]["kind"] == "length" and abs(float(rows["door"]["error_m"])) < 0.2
     size = [np.linalg.norm(c - c.mean(0), axis=1).mean() for c in (camera_poses(found)[2], FLIGHT.centres)]
     assert size[0] / size[1] == pytest.approx(1, abs=0.01)
     (tmp_path / "gps").mkdir()
     beside, _, _ = georeferenced(tmp_path / "gps", model, FLIGHT.photos(sd_m=0.02), lengths=path)
     assert value(beside, "status") == "georeferenced"
-    assert value(beside, "length_rms_m") < 0.2
+    assert value(beside, "length_rms_m") < 0.2 and "lengths_scale_sd_log" not in beside
+
+
+@pytest.mark.parametrize("names", [["door"], ["door", "kerb", "path"]])
+def test_how_far_clicks_leave_a_scale_by_known_lengths_open(tmp_path, model, names):
+    path, rng, scales = tmp_path / "lengths.tsv", np.random.default_rng(0), []
+    sizes = {photo.name: (photo.width, photo.height) for photo in without_gps()}
+    header, *lines = (line.split("\t") for line in length_lines())
+    for noise_px in (0.0, *[1.0] * 60):
+        cells = [line[:4] + [str(float(px) + rng.normal(0, noise_px)) for px in line[4:]] for line in lines]
+        path.write_text("\n".join("\t".join(line) for line in [header, *cells] if line is header or line[0] in names))
+        known = read_lengths(path, model, sizes)
+        scales.append([np.log(known.scale), known.scale_sd_log])
+    exact, *noisy = np.array(scales)
+    off = np.array([log_scale - exact[0] for log_scale, _ in noisy]) / np.array([sd for _, sd in noisy])
+    assert 0.7 < np.sqrt((off**2).mean()) < 1.3
 
 
 def test_known_lengths_bring_an_object_s_model_into_metres(tmp_path, model):
