@@ -512,6 +512,18 @@ def features_of(folder, calibration=None):
     )
 
 
+def matches_of(folder):
+    """Matches the features of a folder's photos."""
+    match_features(
+        photos=folder / "photos.json",
+        features=folder / "features.db",
+        database=folder / "database.db",
+        matches=folder / "matches.json",
+        settings=PAIRS,
+        seed=0,
+    )
+
+
 def test_photos_of_low_contrast_have_features_too(capture, tmp_path):
     (tmp_path / "photos").mkdir()
     for index, name in enumerate(NAMES):
@@ -523,14 +535,7 @@ def test_photos_of_low_contrast_have_features_too(capture, tmp_path):
         counts = [database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()]
         assert len(counts) == 6 and len(database.read_all_cameras()) == 1
     assert min(counts) > 0.5 * max(counts)
-    match_features(
-        photos=tmp_path / "photos.json",
-        features=tmp_path / "features.db",
-        database=tmp_path / "database.db",
-        matches=tmp_path / "matches.json",
-        settings=PAIRS,
-        seed=0,
-    )
+    matches_of(tmp_path)
     assert value(mapped(tmp_path), "registered") == 6
 
 
@@ -621,14 +626,7 @@ def test_photos_that_show_different_things_or_nothing(tmp_path, seen, advice):
         Image.fromarray(noise.astype(np.uint8)).save(tmp_path / "photos" / f"{index}.png")
     features_of(tmp_path)
     with pytest.raises(StageError, match=f"none of the 3 pairs of photos .*{advice}"):
-        match_features(
-            photos=tmp_path / "photos.json",
-            features=tmp_path / "features.db",
-            database=tmp_path / "database.db",
-            matches=tmp_path / "matches.json",
-            settings=PAIRS,
-            seed=0,
-        )
+        matches_of(tmp_path)
     assert not (tmp_path / "database.db").exists() and not (tmp_path / "matches.json").exists()
 
 
