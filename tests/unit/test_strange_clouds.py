@@ -181,6 +181,17 @@ def test_one_name_of_a_colour_alone_is_none(tmp_path):
     assert read.colors is None and set(read.fields) == {"vert", "h", "b"}
 
 
+def test_of_two_columns_of_one_name_the_first_is_meant(tmp_path):
+    """CloudCompare writes what coordinates and normals were before a cloud was moved as further columns."""
+    names = ["nx", "ny", "nz", *(f"scalar_{name}" for name in ("X", "Y", "Z", "Nx", "Ny", "Nz"))]
+    further = [np.full(40, number) for number in (0, 0, 1, 5, 6, 7, 1, 0, 0)]
+    head = HEAD.format(40) + "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    (tmp_path / "a.ply").write_text(head + "\n".join(rows(" ", *further)))
+    read = read_cloud(tmp_path / "a.ply")
+    assert read.points.tolist() == GRID and (read.normals == [0, 0, 1]).all()
+    assert {"X", "Y", "Z", "Nx", "Ny", "Nz"} == set(read.fields)
+
+
 def test_columns_without_names_are_colours_only_where_they_must_be(tmp_path):
     rng = np.random.default_rng(0)
     bright, back, kind = rng.integers(0, 1000, 40), rng.integers(1, 4, 40), np.full(40, 2)
@@ -781,6 +792,15 @@ def test_a_plane_counts_in_the_unit_that_its_keys_name(tmp_path):
     at = np.array([[500_000 / 0.3048, 4_500_000 / 0.3048, 100.0]])
     wanted = to_wgs84(pyproj.CRS("EPSG:26918"), at * 0.3048, "")
     np.testing.assert_allclose(to_wgs84(found, at, ""), wanted, atol=1e-9)
+
+
+def test_a_projection_that_keys_do_not_number_is_not_taken_for_its_datum_in_degrees(tmp_path, capsys):
+    survey(tmp_path / "county.las", {1024: 1, 2048: 4269, 3072: 32767, 3076: 9003})
+    assert las_crs(tmp_path / "county.las") is None and len(read_cloud(tmp_path / "county.las")) == 240
+    assert "its keys name no number of a projected one, only its datum, NAD83" in capsys.readouterr().out
+    survey(tmp_path / "globe.las", {1024: 2, 2048: 4269})
+    with pytest.raises(StageError, match="is in degrees"):
+        read_cloud(tmp_path / "globe.las")
 
 
 @pytest.mark.parametrize("name", ["metre", "m", "Meter"])

@@ -55,12 +55,13 @@ TOGETHER = 1 << 14
 def common_names(names: Sequence[str]) -> list[str]:
     """The names that PLY uses for columns; their own where they are none of position, normal and colour."""
     plain = [AROUND.sub("", re.sub(r"[\s._:-]+", "", name.lower())) for name in names]
-    found = [OTHER_NAMES.get(short, name) for short, name in zip(plain, names)]
+    usual = [OTHER_NAMES.get(short, name) for short, name in zip(plain, names)]
     colored = [[k for k, short in enumerate(plain) if short in called] for called in COLOR_NAMES]
     if all(colored):
         for axis, (first, *_) in zip(COLOR, colored):
-            found[first] = axis
-    return found
+            usual[first] = axis
+    # The first of two is meant: further ones, as of coordinates before they were moved, keep their own names.
+    return [own if name in usual[:k] else name for k, (name, own) in enumerate(zip(usual, names))]
 
 
 def named(columns: Columns) -> Columns:

@@ -153,6 +153,8 @@ def _crs(header: Any) -> "pyproj.CRS | None":
             for key in record.geo_keys
             if key.tiff_tag_location == 0
         }
+        if crs is not None and crs.is_geographic and keys.get(1024) == 1:
+            raise CRSError(f"its keys name no number of a projected one, only its datum, {crs.name}")
         return crs if crs is None or not crs.is_projected or crs.is_compound else with_units(crs, keys)
     except CRSError as error:
         print(f"the file's coordinate system cannot be read and is ignored: {error}", flush=True)
