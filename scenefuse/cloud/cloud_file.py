@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import (
     Cloud,
@@ -18,6 +17,7 @@ from scenefuse.cloud.clouds import (
     concatenate,
     finite_rows,
     precision_note,
+    quick_tree,
     spacing,
     voxel_downsample,
     voxels,
@@ -151,15 +151,7 @@ def summarise(path: Path, look: Look, degrees: bool = False) -> FileSummary:
     if not bright.any() and is_las:
         white = None  # Formats with colours are used for points without, which are black then.
     return FileSummary(
-        path,
-        held.__iter__ if rows <= AT_ONCE else parts,
-        is_las,
-        rows,
-        count,
-        left_out,
-        chosen,
-        white,
-        without_zero,
+        path, held.__iter__ if rows <= AT_ONCE else parts, is_las, rows, count, left_out, chosen, white, without_zero
     )
 
 
@@ -304,11 +296,18 @@ def strays(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     far, size = np.ones(len(points), dtype=bool), float((high - low).max())
     far[near] = False
     if len(near) > NEIGHBOURS and size:
-        tree, parts = cKDTree(points[near]), np.array_split(points[near], 1 + len(near) // AT_ONCE)
-        away = np.concatenate([tree.query(part, k=NEIGHBOURS + 1, workers=threads())[0][:, -1] for part in parts])
-        evenly = voxel_downsample(Cloud(points[near], fields={"away": away})[together], MIN_STRAY_SHARE * size)
-        usual = float(np.median(evenly.fields["away"])) if len(evenly) else np.inf
-        far[near] = away > max(MIN_STRAY_SHARE * float(np.linalg.norm(high - low)), MIN_STRAY_TIMES * usual)
+        tree, least = quick_tree(points[near]), MIN_STRAY_SHARE * float(np.linalg.norm(high - low))
+
+        def away(rows: NDArray[np.int64]) -> NDArray[np.float64]:
+            parts = np.array_split(tree.data[rows], 1 + len(rows) // AT_ONCE)
+            return np.concatenate([tree.query(part, k=NEIGHBOURS + 1, workers=threads())[0][:, -1] for part in parts])
+
+        among = Cloud(tree.data, fields={"row": np.arange(len(near))})[together]
+        usual = away(voxel_downsample(among, MIN_STRAY_SHARE * size).fields["row"]) if len(among) else np.inf
+        # Where a cube that is so long across holds more points, all of these have their neighbours in it.
+        group, counts = voxels(tree.data, least / np.sqrt(3))
+        sparse = np.flatnonzero(counts[group] <= NEIGHBOURS)
+        far[near[sparse]] = away(sparse) > max(least, MIN_STRAY_TIMES * float(np.median(usual)))
     return far if far.mean() <= MAX_ODD_SHARE else np.zeros(len(points), dtype=bool)
 
 

@@ -166,7 +166,12 @@ def _to_nearest(points: NDArray[np.float64], seed: int = 0, cell: float = 0.0) -
         return np.zeros(0)
     one = np.unique(voxels(points, cell)[0], return_index=True)[1] if cell else np.arange(len(points))
     chosen = np.random.default_rng(seed).choice(one, min(5000, len(one)), replace=False)
-    return np.asarray(cKDTree(points).query(points[chosen], k=2)[0][:, 1])
+    return np.asarray(quick_tree(points).query(points[chosen], k=2)[0][:, 1])
+
+
+def quick_tree(points: NDArray[np.float64]) -> cKDTree:
+    """A tree of (N, 3) points that is built in a third of the time: for few queries."""
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def parts(points: NDArray[np.float64], link: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scenefuse.cloud.cloud_file import STRAY_PERCENT, FileSummary, summarise, without_strays
-from scenefuse.cloud.clouds import (
-    Cloud,
-    cloud_of,
-    concatenate,
-    has_unit_normals,
-    spacing,
-    write_cloud,
-)
+from scenefuse.cloud.clouds import Cloud, cloud_of, concatenate, has_unit_normals, spacing, write_cloud
 from scenefuse.cloud.readers.columns import Columns
 from scenefuse.cloud.readers.las import LAS_DIMENSIONS, WITHHELD, las_crs, las_dimensions
 from scenefuse.cloud.tiled_cloud import open_cloud, write_tiled

@@ -3,7 +3,9 @@ import sys
 import laspy
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
+from scenefuse.cloud import cloud_file, clouds
 from scenefuse.cloud.cloud_file import CloudFile, strays
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud
 from scenefuse.cloud.write_las import write_laz
@@ -165,3 +167,20 @@ def test_a_downsampled_cloud_may_have_the_mean_colors_of_its_voxels():
     thin, mean = (voxel_downsample(Cloud(points, colors=colors), 1.0, mean_colors) for mean_colors in (False, True))
     assert thin.colors.tolist() == [[30, 0, 0], [7, 8, 9]] and mean.colors.tolist() == [[40, 20, 10], [7, 8, 9]]
     np.testing.assert_array_equal(thin.points, mean.points)
+
+
+def test_of_a_dense_cloud_few_points_are_asked_for_their_neighbours(monkeypatch):
+    """Of 50 million points each is a quarter of an hour."""
+    asked = list[int]()
+
+    class Counting(cKDTree):
+        def query(self, x, *further, **named):
+            asked.append(len(x))
+            return super().query(x, *further, **named)
+
+    for module in (cloud_file, clouds):
+        monkeypatch.setattr(module, "cKDTree", Counting, raising=False)
+    rng = np.random.default_rng(0)
+    surface = np.column_stack([rng.uniform(0, 10, (100_000, 2)), rng.normal(0, 0.01, 100_000)])
+    found = strays(np.concatenate([surface, rng.uniform(2, 9, (20, 3))]))
+    assert not found[:-20].any() and found[-20:].all() and 0 < sum(asked) < 10_000
