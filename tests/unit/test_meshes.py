@@ -2,6 +2,9 @@
 
 import json
 import os
+import tracemalloc
+import weakref
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,7 +15,8 @@ from support.cloud_files import UTM
 from scenefuse.cloud.cloud_file import CloudFile
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.cloud.formats import with_named
-from scenefuse.cloud.readers.meshes import MESH_POINTS
+from scenefuse.cloud.readers import meshes
+from scenefuse.cloud.readers.meshes import MESH_POINTS, Material, Mesh, sampled_columns
 from scenefuse.core.stage import StageError
 
 # A roof: a large face that looks west and up, a small one that looks east.
@@ -203,3 +207,44 @@ def test_a_picture_behind_options_is_found(tmp_path):
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
     (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl m\nf 1/1 2/2 3/3\n")
     assert (read_cloud(tmp_path / "a.obj").colors == 40).all()
+
+
+def test_one_picture_of_a_mesh_s_materials_is_held(tmp_path):
+    """Twenty of 8192 x 8192 are 4 GB."""
+    held = list[weakref.ref]()
+
+    def picture(number):
+        assert all(other() is None for other in held)
+        found = np.full((4, 4, 3), number, np.uint8)
+        held.append(weakref.ref(found))
+        return found
+
+    corners, faces = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.tile(np.arange(3), (5, 1))
+    materials = tuple(Material(partial(picture, number)) for number in range(5))
+    mesh = Mesh(corners, faces, None, np.tile(corners[None, :, :2], (5, 1, 1)), np.arange(5), materials)
+    assert set(sampled_columns(mesh)["red"].tolist()) == set(range(5)) and len(held) == 5
+
+
+@pytest.mark.parametrize(("ending", "most"), [("ply", 400), ("obj", 600)])
+def test_a_large_mesh_takes_memory_by_its_numbers_alone(tmp_path, monkeypatch, ending, most):
+    """Objects of Python for each face were 10 GB for 20 million of them."""
+    monkeypatch.setattr(meshes, "MESH_POINTS", 1000)
+    x, y = (numbers.ravel() for numbers in np.meshgrid(np.arange(50.0), np.arange(50.0)))
+    first = (np.arange(49)[:, None] * 50 + np.arange(49)).ravel()
+    faces = np.concatenate([first[:, None] + [0, 1, 51], first[:, None] + [0, 51, 50]])
+    corners, path = np.stack([x, y, 0 * x], axis=1), tmp_path / f"a.{ending}"
+    if ending == "obj":
+        lines = [" ".join(["v", *map(str, one)]) for one in corners] + [
+            " ".join(["f", *map(str, f)]) for f in faces + 1
+        ]
+        path.write_text("\n".join(lines))
+    else:
+        rows = np.zeros(len(faces), [("vertex_indices", "i4", (3,))])
+        rows["vertex_indices"] = faces
+        table = np.array(list(map(tuple, corners)), [(axis, "f4") for axis in "xyz"])
+        PlyData([PlyElement.describe(table, "vertex"), PlyElement.describe(rows, "face")]).write(path)
+    read_cloud(path)
+    tracemalloc.start()
+    assert (read_cloud(path).normals == [0, 0, 1]).all()
+    assert tracemalloc.get_traced_memory()[1] < most * len(faces)
+    tracemalloc.stop()

@@ -7,10 +7,12 @@ import codecs
 import io
 import json
 import re
+from array import array
 from base64 import b64decode
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import chain, takewhile
+from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -38,12 +40,12 @@ INSTANCE_PARTS = ("TRANSLATION", "ROTATION", "SCALE")
 
 @dataclass(frozen=True)
 class Material:
-    """The colour of faces: a picture (H, W, 3) RGB where there is one, else one colour, 0..255.
+    """The colour of faces: a picture (H, W, 3) RGB where there is one that can be read, else one colour, 0..255.
 
     A matrix (2, 3) leads from places (u, v, 1) of a mesh to those in the picture.
     """
 
-    picture: NDArray[np.uint8] | None = None
+    picture: Callable[[], NDArray[np.uint8] | None] | None = None
     color: tuple[float, ...] = (255.0, 255.0, 255.0)
     place: Array = field(default_factory=lambda: np.eye(2, 3))
 
@@ -106,31 +108,39 @@ def sampled_columns(mesh: Mesh) -> Columns:
 
 def _colors(mesh: Mesh, face: NDArray[np.int64], weights: Array) -> Array | None:
     """(N, 3) colours at points of faces (N,) with barycentric weights (N, 3): of a picture, else the vertices, else the
-    material. Beside materials, programs write white for vertices that have none."""
-    plain = all(material.picture is None and material.color == Material.color for material in mesh.materials)
+    material. Beside materials, programs write white for vertices that have none. Of the pictures one is held."""
+    of = np.where(mesh.material < len(mesh.materials), mesh.material, -1)[face]
+    painted = np.full((len(face), 3), np.nan)
+    for number, material in enumerate(mesh.materials):
+        rows = np.flatnonzero(of == number)
+        if material.picture is not None and mesh.uvs is not None and len(rows):
+            painted[rows] = _texels(material, np.einsum("nk,nkc->nc", weights[rows], mesh.uvs[face[rows]]))
+    pictured = np.isfinite(painted)
+    plain = not pictured.any() and all(material.color == Material.color for material in mesh.materials)
     own = None if mesh.colors is None or not ((mesh.colors < 255).any() or plain) else mesh.colors
     if own is None and plain:
         if mesh.materials:
             print("note: the mesh's materials have neither pictures nor colours: it has none", flush=True)
         return None
-    of = np.where(mesh.material < len(mesh.materials), mesh.material, -1)[face]
     colors = np.array([*(material.color for material in mesh.materials), Material.color])[of]
     if own is not None:
         at = np.einsum("nk,nkc->nc", weights, own[mesh.faces[face]])
         colors = np.where(np.isfinite(at), at, colors)
-    for number, material in enumerate(mesh.materials):
-        rows = np.flatnonzero(of == number)
-        if material.picture is None or mesh.uvs is None:
-            continue
-        uv = np.einsum("nk,nkc->nc", weights[rows], mesh.uvs[face[rows]])
-        known = np.isfinite(uv).all(1)
+    return np.where(pictured, painted, colors)
+
+
+def _texels(material: Material, uv: Array) -> Array:
+    """(N, 3) colours of a material's picture at places (N, 2), NaN where these are, or where it cannot be read."""
+    found, known = np.full((len(uv), 3), np.nan), np.isfinite(uv).all(1)
+    picture = material.picture and material.picture()
+    if picture is not None:
         uv = uv[known] @ material.place[:, :2].T + material.place[:, 2]
         uv = np.where((uv < 0) | (uv > 1), uv % 1, uv)
-        height, width = material.picture.shape[:2]
+        height, width = picture.shape[:2]
         column = np.minimum((uv[:, 0] * width).astype(int), width - 1)
         row = np.minimum(((1 - uv[:, 1]) * height).astype(int), height - 1)
-        colors[rows[known]] = material.picture[row, column]
-    return colors
+        found[known] = picture[row, column]
+    return found
 
 
 def triangles(
@@ -206,46 +216,44 @@ def read_obj(path: Path) -> Columns:
 
     Without faces its vertices are the points.
     """
-    vertices, uvs = list[list[float]](), list[list[float]]()
-    # Rows of `vertices` and of `uvs`, -1 where a corner has none of these.
-    polygons, places = list[list[int]](), list[list[int]]()
-    used, libraries, material = list[str](), list[str](), ""
+    # Six numbers of each vertex, two of each place in a picture; rows of these of all corners, -1 for none.
+    vertices, uvs, rows, places = array("d"), array("d"), array("q"), array("q")
+    # Corners and material of each polygon.
+    lengths, used, names = array("q"), array("q"), {"": 0}
+    libraries, material = list[str](), 0
     for line in _obj_lines(path):
         word, rest = (*line.split(None, 1), "", "")[:2]
         numbers = rest.split("#")[0].split()
         if word == "v":
-            vertices.append([float(cell) for cell in numbers])
+            vertices.extend(map(float, numbers[:6] if len(numbers) > 5 else [*numbers[:3], *["nan"] * 3]))
         elif word == "vt":
-            uvs.append([float(cell) for cell in [*numbers, "0"][:2]])
+            uvs.extend(map(float, [*numbers, "0"][:2]))
         elif word == "f":
-            cells = [cell.split("/") for cell in numbers]
-            polygons.append([_row(cell[0], len(vertices)) for cell in cells])
-            places.append([_row(c[1], len(uvs)) if len(c) > 1 and c[1] else -1 for c in cells])
+            cells = [(cell + "//").split("/", 2) for cell in numbers]
+            rows.extend(_rows([cell[0] for cell in cells], len(vertices) // 6))
+            places.extend(_rows([cell[1] for cell in cells], len(uvs) // 2))
+            lengths.append(len(cells))
             used.append(material)
         elif word == "usemtl":
-            material = rest.strip()
+            material = names.setdefault(rest.strip(), len(names))
         elif word == "mtllib":
             libraries.append(rest.strip())
-    if not vertices:
-        return {axis: np.empty(0) for axis in "xyz"}
     # A file of several objects may have colours of some.
-    table = np.array([vertex[:6] if len(vertex) >= 6 else [*vertex[:3], *[np.nan] * 3] for vertex in vertices])
+    table = np.array(vertices).reshape(-1, 6)
     painted = np.isfinite(table[:, 3:]).all(1)
-    if not polygons:
+    if not lengths:
         columns: Columns = dict(zip("xyz", table[:, :3].T))
         return columns | dict(zip(COLOR, bytes_of(table[:, 3:]).T)) if painted.all() else columns
-    rows, at = (np.fromiter(chain.from_iterable(some), np.int64) for some in (polygons, places))
-    corners, of = triangles(np.array(list(map(len, polygons))), rows, table[:, :3])
+    corners, of = triangles(np.array(lengths), np.array(rows), table[:, :3])
     files = [file for name in libraries for file in _libraries(path.parent, name)]
     known = dict(pair for file in files for pair in _materials(file).items())
-    names = sorted(set(used))
     return sampled_columns(
         Mesh(
             table[:, :3],
-            rows[corners],
+            np.array(rows)[corners],
             np.where(painted[:, None], bytes_of(table[:, 3:]), np.nan) if painted.any() else None,
-            np.array([*uvs, [np.nan, np.nan]], np.float64)[at[corners]],
-            np.array([names.index(name) for name in used])[of],
+            np.array([*uvs, np.nan, np.nan]).reshape(-1, 2)[np.array(places)[corners]],
+            np.array(used)[of],
             tuple(known.get(name, Material()) for name in names) if known else (),
         )
     )
@@ -255,15 +263,15 @@ def _obj_lines(path: Path) -> Iterator[str]:
     """The lines of an OBJ, those that a backslash continues in one."""
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         for line in file:
-            while line.rstrip().endswith("\\") and (more := file.readline()):
+            while "\\" in line and line.rstrip().endswith("\\") and (more := file.readline()):
                 line = line.rstrip()[:-1] + " " + more
             yield line
 
 
-def _row(cell: str, count: int) -> int:
-    """A reference of OBJ, from 1, or from the end if negative, as a row from 0."""
-    number = int(cell)
-    return number - 1 if number > 0 else count + number
+def _rows(cells: list[str], count: int) -> list[int]:
+    """References of OBJ, from 1, or from the end if negative, as rows from 0; -1 for an empty one."""
+    numbers = [int(cell or 0) for cell in cells]
+    return [number - 1 if number >= 0 else count + number for number in numbers]
 
 
 def _libraries(folder: Path, names: str) -> list[Path]:
@@ -316,7 +324,7 @@ def _materials(path: Path) -> dict[str, Material]:
             found[name] = replace(found[name], color=color if len(color) == 3 else Material.color)
         elif word.lower() == "map_kd" and name:
             options = OPTIONS.match(rest)
-            picture = picture_of(beside(path.parent, rest[options.end() if options else 0 :]))
+            picture = partial(picture_of, beside(path.parent, rest[options.end() if options else 0 :]))
             found[name] = replace(found[name], picture=picture, place=_placed(options[0] if options else ""))
     return found
 
@@ -528,7 +536,7 @@ class _Gltf:
             encoded = self.buffers[view["buffer"]][start : start + view["byteLength"]]
         else:
             encoded = self.content(image["uri"]) if "uri" in image else b""
-        picture = _picture(encoded, image.get("name", f"number {source}"))
+        picture = partial(_picture, encoded, image.get("name", f"number {source}"))
         cos, sin = np.cos(texture.get("rotation", 0.0)), np.sin(texture.get("rotation", 0.0))
         place = np.eye(3)
         place[:2, :2] = np.array([[cos, -sin], [sin, cos]]) * texture.get("scale", [1, 1])

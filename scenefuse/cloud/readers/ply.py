@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scenefuse.cloud.readers.columns import (
     COLOR,
@@ -120,16 +122,16 @@ def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
         yield vertex
         return
     colors, points = colors_of(vertex), positions(vertex)
-    lengths, rows = np.array([len(corners) for corners in faces]), np.concatenate(faces).astype(np.int64)
-    places, of = triangles(lengths, rows, points)
+    lengths, rows = _flat(faces)
+    places, of = triangles(lengths, rows := rows.astype(np.int64), points)
     uvs = next((np.stack([vertex[u], vertex[v]], axis=1)[rows] for u, v in PLACE_NAMES if {u, v} <= set(vertex)), None)
-    if PLACES in face and sum(map(len, face[PLACES])) == 2 * len(rows):
-        uvs = np.concatenate(face[PLACES]).astype(np.float64).reshape(-1, 2)
+    if PLACES in face and len(own := _flat(face[PLACES])[1]) == 2 * len(rows):
+        uvs = own.astype(np.float64).reshape(-1, 2)
     if colors is None and set(COLOR) <= set(face):
         colors = np.repeat(np.array([face[name] for name in COLOR]).T, lengths, axis=0)
         points, rows = points[rows], np.arange(len(rows))
     painted = None if colors is None else bytes_of(colors).astype(np.float64)
-    textures = () if uvs is None else tuple(Material(picture_of(file)) for file in named_by_ply(path))
+    textures = () if uvs is None else tuple(Material(partial(picture_of, file)) for file in named_by_ply(path))
     numbers = np.array(face.get("texnumber", np.zeros(len(faces)))).astype(np.int64)[of]
     yield sampled_columns(Mesh(points, rows[places], painted, None if uvs is None else uvs[places], numbers, textures))
 
@@ -162,14 +164,24 @@ def _numbers(table: dict[str, Any]) -> Columns:
     return {name: v for name, v in table.items() if isinstance(v, np.ndarray) and v.dtype.kind in "iuf"}
 
 
-def _tables_of_bytes(path: Path) -> dict[str, dict[str, Any]]:
-    """The properties of each element by their names."""
-    from plyfile import PlyData
+def _flat(lists: Any) -> tuple[NDArray[np.int64], NDArray[Any]]:
+    """Lengths (P,) of lists, which a table (P, K) may hold, and all that they hold (N,)."""
+    if isinstance(lists, np.ndarray) and lists.ndim == 2:
+        return np.full(len(lists), lists.shape[1]), lists.ravel()
+    return np.array([len(one) for one in lists]), np.concatenate(lists)
 
-    tables = {element.name: element.data for element in PlyData.read(path)}
+
+def _tables_of_bytes(path: Path) -> dict[str, dict[str, Any]]:
+    """The properties of each element by their names; lists that are all as long as a triangle's in a table."""
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        content = PlyData.read(path, known_list_len={FACES: dict.fromkeys(CORNERS, 3) | {PLACES: 6}})
+    except (PlyParseError, ValueError):  # others are read row by row
+        content = PlyData.read(path)
     return {
-        own: {n.removeprefix(FIELD): rows[n].astype(rows[n].dtype.newbyteorder("=")) for n in rows.dtype.names or ()}
-        for own, rows in tables.items()
+        e.name: {n.removeprefix(FIELD): e[n].astype(e[n].dtype.newbyteorder("=")) for n in e.data.dtype.names or ()}
+        for e in content
     }
 
 
@@ -251,14 +263,8 @@ def _elements(lines: list[str], order: str) -> list[Element]:
     own = {name: kind for element, _, kinds in found if element == "vertex" for name, kind in kinds.items()}
     if unknown := next((name for name, kind in own.items() if kind not in {*TYPES, "list"}), ""):
         raise ValueError(f"its property {unknown} is of type {own[unknown]}, which PLY does not have: leave it out")
-    return [
-        Element(
-            name,
-            count,
-            np.dtype([(own, order + TYPES[kind]) for own, kind in kinds.items()])
-            if {*kinds.values()} <= {*TYPES}
-            else None,
-            kinds,
-        )
-        for name, count, kinds in found
+    rows = [
+        np.dtype([(own, order + TYPES[kind]) for own, kind in kinds.items()]) if {*kinds.values()} <= {*TYPES} else None
+        for _, _, kinds in found
     ]
+    return [Element(name, count, row, kinds) for (name, count, kinds), row in zip(found, rows)]
