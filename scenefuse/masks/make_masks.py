@@ -38,7 +38,7 @@ from scenefuse.photos.cameras.given import QUARTERS
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.photo_files import masks_by_name, no_match
 from scenefuse.photos.photos import orientations_in
-from scenefuse.photos.pictures import read_supplied_mask, write_picture
+from scenefuse.photos.pictures import read_supplied_mask, require_white_object, write_picture
 from scenefuse.photos.workspace import View, Workspace, read_cameras, read_workspace
 
 # Width of a photo on the contact sheet, and photos side by side.
@@ -105,9 +105,9 @@ def make_masks(
     kept = [view.name for view in photos.views if view.name not in made.dropped]
     if len(kept) < settings.min_photos:
         enough = len(photos.views) >= settings.min_photos
-        advice = (
-            "check that the prompts span the object, or supply masks" if enough else "take more photos of the object"
-        )
+        masked = settings.method == "supplied"
+        mask_more = "supply masks of more" if masked else "check that the prompts span the object, or supply masks"
+        advice = mask_more if enough else "take more photos of the object"
         raise StageError(
             f"only {len(kept)} of {len(photos.views)} photos in {inputs.workspace} have a good mask,"
             f" {settings.min_photos} needed: {advice}"
@@ -205,10 +205,7 @@ def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Worksp
         raise StageError("method supplied needs a folder of masks; set its path in config/objects.tsv")
     turned = orientations_in(read_json(inputs.photos_json))
     found, unusable = supplied_masks(inputs.supplied, inputs.sparse, photos.views, turned)
-    # Their whole border is white, and their middle is not.
-    holes = [m[[0, -1]].all() and m[:, [0, -1]].all() and not m[len(m) // 2, m.shape[1] // 2] for m in found.values()]
-    if 2 * sum(map(bool, holes)) > len(holes):
-        raise StageError(f"the masks in {inputs.supplied} are black on the object; invert them: it has to be white")
+    require_white_object(found.values(), inputs.supplied)
     missing = {view.name: "no mask was supplied" for view in photos.views if view.name not in found}
     # Programs write a black mask of each photo in which nothing was drawn: it denies no point.
     missing |= {name: "empty mask" for name, mask in found.items() if not mask.any()}

@@ -28,7 +28,14 @@ from scenefuse.photos.photos import (
     inspect_photo,
     stretch_notes,
 )
-from scenefuse.photos.pictures import read_raw, read_supplied_mask, stretched, write_picture
+from scenefuse.photos.pictures import (
+    read_mask,
+    read_raw,
+    read_supplied_mask,
+    require_white_object,
+    stretched,
+    write_picture,
+)
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm.gravity import estimate_up
 
@@ -87,6 +94,7 @@ def import_photos(
                 held_out += [view.name] if photo.held_out else []
         if not kept:
             raise StageError(_no_masks(data, photos, masks))
+        require_white_object(map(read_mask, sorted(folder.iterdir())), masks or data)
         write_model(output / "sparse", kept)
         if held_out:
             (output / "held_out.txt").write_text("".join(f"{name}\n" for name in held_out))

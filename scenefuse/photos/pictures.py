@@ -1,6 +1,7 @@
 """Pictures on disk, their pixels as they are stored, and maps of depth, normals and confidence in COLMAP's binary
 format, which its own tools read."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,8 @@ def matte_of(picture: NDArray[Any]) -> NDArray[np.bool_]:
     """A mask picture as (H, W) bool: alpha where it varies, else brightness, above half of the largest value.
 
     Raises:
-        StageError: most of it is grey, as of a photo, or it has areas of several values or colours, as of labels.
+        StageError: most of what it shows is grey, as of a photo, cut out on black or not, or it has areas of several
+            values or colours, as of labels: of two where these are as bright as each other.
     """
     if picture.ndim == 3 and picture.shape[2] == 4 and picture[..., 3].min() < picture[..., 3].max():
         picture = picture[..., 3]
@@ -53,11 +55,22 @@ def matte_of(picture: NDArray[Any]) -> NDArray[np.bool_]:
         picture = picture[..., :3]
     channel = picture.max(2) if picture.ndim == 3 else picture
     top = max(1, channel.max())
-    if (areas := _even_areas(picture, top)) > 2:
+    mask, shades = np.asarray(channel > top / 2), channel[::4, ::4] / top
+    if (areas := _even_areas(picture, top)) > 2 - mask.all():
         raise StageError(f"it has areas of {areas} values, as labels of several things have: give the object's alone")
-    if np.median(np.abs(channel[::4, ::4] / top - 0.5)) < 0.4:
-        raise StageError("it is no mask: most of it is grey")
-    return np.asarray(channel > top / 2)
+    grey, white = np.abs(shades - 0.5) < 0.4, shades >= 0.9
+    # Soft edges are less: three times what is white of a mask feathered far, a fiftieth of the picture of a thin thing.
+    if grey.mean() > np.clip(3 * white.mean(), 0.02, 0.5):
+        raise StageError("it is no mask: most of what it shows is grey")
+    return mask
+
+
+def require_white_object(masks: Iterable[NDArray[np.bool_]], source: object) -> None:
+    """StageError where most of some masks (H, W) are white along most of their edge and black in the middle."""
+    borders = ((mask, np.concatenate([*mask[[0, -1]], *mask[:, [0, -1]].T])) for mask in masks)
+    holes = [border.mean() > 0.5 and not mask[len(mask) // 2, mask.shape[1] // 2] for mask, border in borders]
+    if 2 * np.sum(holes) > len(holes):
+        raise StageError(f"the masks in {source} are black on the object; invert them: it has to be white")
 
 
 def read_supplied_mask(file: Path, size: tuple[int, int], quarters: int = 0) -> NDArray[np.bool_]:
@@ -71,7 +84,8 @@ def read_supplied_mask(file: Path, size: tuple[int, int], quarters: int = 0) -> 
         mask = matte_of(read_raw(file))
     except StageError as error:
         raise StageError(
-            f"the mask {file} cannot be read ({str(error).split(';')[0]}); export it again as PNG"
+            f"the mask {file} cannot be read ({str(error).split(';')[0]}); export it again as PNG, white on"
+            " the object and black elsewhere"
         ) from None
     if quarters % 2 and same_shape(mask.shape, size) and not same_shape(mask.shape, size[::-1]):
         mask = np.rot90(mask, -quarters)

@@ -321,12 +321,32 @@ def test_bad_input_is_one_sentence(tmp_path, damage, words):
     assert not (tmp_path / "undistorted").exists() and not (tmp_path / "masks").exists()
 
 
-def test_a_photo_is_no_mask(tmp_path):
+@pytest.mark.parametrize("cut_out", [False, True])
+def test_a_photo_is_no_mask_and_neither_is_what_is_cut_out_of_it(tmp_path, cut_out):
     data = nerfstudio(tmp_path / "in")
-    grey = np.random.default_rng(0).integers(60, 200, (64, 96, 3)).astype(np.uint8)
+    grey = np.random.default_rng(0).integers(60, 200, (64, 96)).astype(np.uint8)
+    if cut_out:
+        grey[np.hypot(*np.mgrid[-32:32, -48:48]) > 15] = 0
     cv2.imwrite(str(data / "masks/02.png"), grey)
-    with pytest.raises(StageError, match=r"masks/02.png cannot be read \(it is no mask: most of it is grey\); export"):
+    with pytest.raises(StageError, match=r"02.png cannot be read \(it is no mask: most of what it shows is grey\); ex"):
         imported(data, tmp_path)
+
+
+def test_masks_that_are_black_on_the_object_are_an_error(tmp_path):
+    data = nerfstudio(tmp_path / "in")
+    for mask in (data / "masks").iterdir():
+        cv2.imwrite(str(mask), np.where(np.hypot(*np.mgrid[-32:32, -48:48]) < 25, 0, 255))
+    with pytest.raises(StageError, match="the masks in .*in are black on the object; invert them"):
+        imported(data, tmp_path)
+    assert not (tmp_path / "masks").exists()
+
+
+def test_two_colours_as_bright_as_each_other_are_no_mask(tmp_path):
+    labels = np.full((64, 96, 3), (0, 0, 255), np.uint8)
+    labels[20:40, 30:60] = 0, 255, 0
+    with pytest.raises(StageError, match="it has areas of 2 values"):
+        matte_of(labels)
+    assert matte_of(np.full((64, 96), 255, np.uint8)).all()
 
 
 @pytest.mark.parametrize("values", [(1, 2, 3), (60, 120, 200), ((255, 0, 0), (0, 255, 0), (0, 0, 255))])
@@ -344,7 +364,8 @@ def test_labels_of_several_things_are_no_mask(tmp_path, values):
 def test_a_mask_with_a_soft_edge_or_of_one_label_is_one(tmp_path, ending):
     disc = np.hypot(*np.mgrid[-200:200, -300:300]) < 100
     soft = cv2.GaussianBlur(255 * disc.astype(np.uint8), (0, 0), 8)
-    for mask in (soft, disc.astype(np.uint8), np.dstack([np.zeros_like(soft), np.zeros_like(soft), 200 * disc])):
+    low = cv2.resize(cv2.resize(soft, (30, 20), interpolation=cv2.INTER_AREA), (600, 400))
+    for mask in (soft, low, disc.astype(np.uint8), np.dstack([np.zeros_like(soft), np.zeros_like(soft), 200 * disc])):
         cv2.imwrite(str(tmp_path / f"a.{ending}"), mask)
         if ending == "png" or mask.max() > 1:
             assert np.mean(matte_of(read_raw(tmp_path / f"a.{ending}")) != disc) < 0.01

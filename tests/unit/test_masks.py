@@ -193,11 +193,15 @@ def test_supplied_masks_are_taken_as_they_are_and_strangers_are_an_error(capture
     assert not (tmp_path / "x").exists()
 
 
-def test_masks_that_are_black_on_the_object_are_an_error(capture, tmp_path):
+@pytest.mark.parametrize("foot", [0, 45])
+def test_masks_that_are_black_on_the_object_are_an_error(capture, tmp_path, foot):
+    """Also where it reaches to the photo's edge."""
     supplied = tmp_path / "supplied"
     shutil.copytree(capture / "truth", supplied)
     for file in supplied.iterdir():
-        cv2.imwrite(str(file), 255 - cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
+        mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        mask[HEIGHT - foot :, 40:80] = 255
+        cv2.imwrite(str(file), 255 - mask)
     with pytest.raises(StageError, match="are black on the object; invert them"):
         run_stage(capture, tmp_path, method="supplied", prompts=None, supplied=supplied)
 
@@ -211,6 +215,13 @@ def test_black_masks_of_photos_in_which_nothing_was_drawn_deny_nothing(capture, 
     report = read_json(tmp_path / "masks.json")
     assert report["dropped"] == dict.fromkeys(["f1.png", "f4.png", "f6.png"], "empty mask")
     assert value(report, "median_agreement") > 0.9
+
+
+def test_too_few_supplied_masks_ask_for_more_of_them(capture, tmp_path):
+    supplied = tmp_path / "supplied"
+    shutil.copytree(capture / "truth", supplied, ignore=lambda *_: [f"f{k}_mask.png" for k in range(3, PHOTOS)])
+    with pytest.raises(StageError, match="only 3 of 8 photos in .* have a good mask, 4 needed: supply masks of more"):
+        run_stage(capture, tmp_path, method="supplied", prompts=None, supplied=supplied)
 
 
 def test_bad_supplied_masks_are_left_out_with_their_reason(capture, tmp_path):
