@@ -98,9 +98,6 @@ def shared_colors(photos: PhotoTensors, depths: Tensor) -> SharedColors:
     """Pairs of pixels (V, h, w) that show one place, from depths (V, h, w) along z, 0 for none."""
     near = nearest(photos.center, COMPARED_PHOTOS)
     parts = [_shared(photos, depths, view, int(other)) for view in range(len(photos)) for other in near[view]]
-    if not parts:
-        none = torch.zeros(0, dtype=torch.int64)
-        return SharedColors(none, none, torch.zeros(0, 2), torch.zeros(0, 3))
     return SharedColors(*(torch.cat(column) for column in zip(*parts)))
 
 
@@ -220,11 +217,10 @@ def photo_weights(sharpness: Tensor, center: Tensor) -> Tensor:
         sharpness: (V,) as `measured_sharpness` has it.
         center: (V, 3) camera centres.
     """
-    count = len(sharpness)
-    if count < 2:
-        return torch.ones(count)
-    share = sharpness / torch.quantile(sharpness[nearest(center, COMPARED_PHOTOS)], 0.5, dim=1).clamp(min=1e-9)
-    return torch.where(share < MIN_SHARPNESS_SHARE, (share / MIN_SHARPNESS_SHARE) ** 2, torch.ones(count))
+    # Where nothing has any detail, as in clipped photos, all are alike.
+    sharpness = sharpness.clamp(min=1e-9)
+    share = sharpness / torch.quantile(sharpness[nearest(center, COMPARED_PHOTOS)], 0.5, dim=1)
+    return torch.where(share < MIN_SHARPNESS_SHARE, (share / MIN_SHARPNESS_SHARE) ** 2, torch.ones(len(share)))
 
 
 def measured_sharpness(images: Tensor, masks: Tensor) -> Tensor:

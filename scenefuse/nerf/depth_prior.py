@@ -114,7 +114,7 @@ def crop_to_object(views: Views, crop_px: int) -> Crops:
     """Cut each photo to the box around its mask.
 
     The canvas has the median shape of these boxes and about crop_px squared pixels; a cut is shrunk to fit, never
-    enlarged. Sides are multiples of four. A photo whose mask is empty shows its middle.
+    enlarged. Sides are multiples of four.
     """
     height, width = views.masks.shape[1:]
     boxes = np.array([_box(mask) for mask in views.masks])
@@ -142,11 +142,8 @@ def crop_to_object(views: Views, crop_px: int) -> Crops:
 
 
 def _box(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Left, top, right, bottom of the mask; the middle half of the photo when it is empty."""
-    height, width = mask.shape
+    """Left, top, right, bottom of a mask that is not empty."""
     rows, columns = np.nonzero(mask)
-    if len(rows) == 0:
-        return np.array([0.25 * width, 0.25 * height, 0.75 * width, 0.75 * height])
     return np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], dtype=np.float64)
 
 
@@ -259,6 +256,5 @@ def _between_points(views: Views, known: ObjectPoints, index: int) -> Array:
 
 def _gray(views: Views, index: int) -> View:
     """A cut photo in grey, (H, W) float32 in 0..1."""
-    pose = np.linalg.inv(views.object_from_cam[index])
-    pixels = views.images[index].mean(2, dtype=np.float32) / np.float32(255)
-    return View(str(index), views.intrinsics[index], pose, pixels.shape[1], pixels.shape[0], pixels)
+    view = views.view(index)
+    return replace(view, pixels=view.pixels.mean(2, dtype=np.float32) / np.float32(255))

@@ -69,7 +69,7 @@ class PixelPool:
     """Pixels that training draws from, view after view: `pixel` holds row * W + column, `start` (V + 1,) the bounds.
 
     Attributes:
-        inside: pixels of the object.
+        inside: pixels of the object, of which every view has some.
         inside_start: bounds of each view in `inside`.
         outside: pixels beside the object.
         outside_start: bounds of each view in `outside`.
@@ -178,13 +178,9 @@ def _draw_pixels(pool: PixelPool, view: int, rays: int, rng: np.random.Generator
     first, last = pool.inside_start[view : view + 2]
     ring_first, ring_last = pool.outside_start[view : view + 2]
     outside = round(rays * OUTSIDE_SHARE) if ring_last > ring_first else 0
-    outside = rays if last == first else outside
-    pixels = np.zeros(rays, dtype=np.int64)
-    if outside and ring_last > ring_first:
-        pixels[:outside] = pool.outside[rng.integers(ring_first, ring_last, outside)]
-    if outside < rays:
-        pixels[outside:] = pool.inside[rng.integers(first, last, rays - outside)]
-    return pixels, outside
+    beside = pool.outside[rng.integers(ring_first, ring_last, outside)]
+    inside = pool.inside[rng.integers(first, last, rays - outside)]
+    return np.concatenate([beside, inside]).astype(np.int64), outside
 
 
 def camera_rays(intrinsics: Tensor, rotation: Tensor, center: Tensor, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -138,7 +138,7 @@ def train_stage(
     warm = given.earlier is not None and given.earlier["model"]["settings"] == nerf.state()["settings"]
     if given.earlier is not None and warm:
         go_on_from(nerf, given.earlier["model"])
-    photos = given.photos.select(given.trained)
+    photos = given.photos
     additions = None if add is None else add(nerf, photos)
     weight = torch.ones(len(photos))
     if settings.recipe.appearance:
@@ -187,7 +187,8 @@ def photo_tensors(views: Views, nerf_from_object: Sim3, prior: DepthPrior | None
 
 @dataclass(frozen=True)
 class _Given:
-    """What a stage has read: photos, the rows (T,) of those it trains on, where the object is, prior, earlier stage."""
+    """What a stage has read: photos, the rows (T,) of those it trains on, where the object is, prior, these photos as
+    tensors, earlier stage."""
 
     views: Views
     trained: NDArray[np.int64]
@@ -212,7 +213,7 @@ def _read(inputs: NerfInputs, settings: NerfSettings, hold_out_every: int) -> _G
     volume = find_volume(seen, cells, tolerance, cube, views.sparse[own_points(views)])
     prior = None if inputs.prior is None else read_prior(inputs.prior, views)
     photos = photo_tensors(views, volume.nerf_from_object, prior, exact=settings.recipe.mask_band_px == 0)
-    photos = replace(photos, hidden=torch.from_numpy(hidden_pixels(volume, outlines)))
+    photos = replace(photos, hidden=torch.from_numpy(hidden_pixels(volume, outlines))).select(trained)
     return _Given(views, trained, volume, prior, photos, earlier)
 
 

@@ -54,7 +54,7 @@ def find_volume(
         own: (N, 3) points on the object: they say where it is where few photos have it whole, and how many have a part.
 
     Raises:
-        StageError: fewer than two photos have a mask, or no cell is left.
+        StageError: fewer than two photos, or no cell is left.
     """
     try:
         if cube is None:
@@ -135,13 +135,11 @@ def cube_from_cameras(views: list[View]) -> Sim3:
     Its centre is the point nearest to the viewing rays of the masks' centres; its size follows from their extents.
 
     Raises:
-        ValueError: fewer than two photos have a mask.
+        ValueError: fewer than two photos.
     """
     normal, right, centres, angles = np.zeros((3, 3)), np.zeros(3), [], []
     for view in views:
         rows, columns = np.nonzero(view.pixels)
-        if len(rows) == 0:
-            continue
         # A few stray pixels of a mask do not count.
         box = np.percentile(columns, [0.5, 99.5]), np.percentile(rows, [0.5, 99.5])
         middle = np.array([box[0].mean() + 0.5, box[1].mean() + 0.5, 1.0])
@@ -152,7 +150,7 @@ def cube_from_cameras(views: list[View]) -> Sim3:
         centres.append(view.centre)
         angles.append(0.5 * np.hypot(np.ptp(box[0]) / view.intrinsics[0, 0], np.ptp(box[1]) / view.intrinsics[1, 1]))
     if len(centres) < 2:
-        raise ValueError("fewer than two photos have a mask of the object")
+        raise ValueError("fewer than two photos with a mask of the object are trained on")
     center = np.linalg.solve(normal, right)
     radius = max(np.percentile(np.linalg.norm(np.array(centres) - center, axis=1) * np.array(angles), 90), 1e-9)
     scale = 0.5 / ((1 + 2 * ROUGH_MARGIN) * radius)

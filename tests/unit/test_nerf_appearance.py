@@ -85,7 +85,7 @@ def test_photos_that_share_nothing_keep_a_gain_of_one(spoilt, gains):
     between = found.log_gain[others] - gains[others]
     assert float((between - between.mean(0)).abs().max()) < 0.02
     assert not found.log_gain[5].any()
-    alone = solved(shared_colors(small.select(np.array([0])), depths[:1]), 1)
+    alone = solved(shared_colors(small.select(np.array([0, 6])), 0 * depths[:2]), 2)
     assert not alone.log_gain.any() and not alone.falloff.any()
 
 
@@ -169,3 +169,8 @@ def test_a_blurred_photo_weighs_less_and_sharp_ones_do_not():
     assert weight[3] < 0.7 and (weight[torch.arange(12) != 3] == 1).all()
     empty = measured_sharpness(images, masks & False)
     assert (photo_weights(empty, center) == 1).all()
+
+
+def test_photos_without_any_detail_weigh_as_much_as_each_other():
+    images, masks = torch.full((3, 20, 20, 3), 255, dtype=torch.uint8), torch.ones(3, 20, 20, dtype=torch.bool)
+    assert (photo_weights(measured_sharpness(images, masks), torch.eye(3)) == 1).all()

@@ -71,7 +71,7 @@ def test_masks_without_a_common_volume_give_an_empty_hull(sphere):
     empty = silhouettes(masks & False, None, k, poses)
     assert not visual_hull(empty, Sim3.identity(), 32, 0.0).any()
     with pytest.raises(ValueError, match="fewer than two photos"):
-        cube_from_cameras([outline.view for outline in empty])
+        cube_from_cameras([outline.view for outline in silhouettes(masks[:1], None, k[:1], poses[:1])])
 
 
 def test_pixels_that_something_stands_before_do_not_teach_emptiness(sphere):
