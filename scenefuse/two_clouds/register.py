@@ -153,7 +153,7 @@ def register(
     written = _write(out, format, given, found, scene, seed)
     if not found.registered:
         written.append(out / BOX_PAGE)
-        shown = CloudFile.of(scene, most=MAX_SEARCHED_POINTS).part if marked or boxed else whole
+        shown = without_strays(CloudFile.of(scene, most=MAX_SEARCHED_POINTS).part if marked or boxed else whole, "")[0]
         write_box_page(written[-1], shown, known.ups()[1], [box for _, box in places], command)
     if fuse:
         written += _fuse(out, given, found, content, known, config)

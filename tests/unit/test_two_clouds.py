@@ -371,6 +371,19 @@ def test_a_refusal_ends_in_places_whose_boxes_can_be_pasted(tmp_path, house, mon
     assert len(searched) == 2 and len(searched[1][1]) == 300
 
 
+def test_a_stray_far_away_does_not_make_the_scene_a_dot_in_the_page_to_draw_in(tmp_path, house, monkeypatch):
+    registered_at_once(monkeypatch, house.scene_from_object, registered=False)
+    stray = Cloud(house.scene.points[:1] + [9000, 0, 0], None, house.scene.colors[:1])
+    write_cloud(tmp_path / "yard.ply", concatenate([house.scene, stray]))
+    write_cloud(tmp_path / "house.ply", house.object)
+    box = Known(crop_box=(*house.scene.points.min(0), *house.scene.points.max(0)))
+    known = {"object": tmp_path / "house.ply", "scene": tmp_path / "yard.ply", "out": tmp_path / "out"}
+    assert register(**known, known=box) == 3
+    page = (tmp_path / "out/crop_box.html").read_text()
+    step = json.loads(re.search(r'id="about">(.*?)</script>', page)[1])["step"][0]
+    assert abs(step) < 0.01 * house.scene.diagonal
+
+
 @pytest.mark.process
 @pytest.mark.parametrize("phone", [False, True])
 def test_the_box_drawn_in_the_page_of_a_refusal_holds_the_object_and_its_command_finds_it(tmp_path, house, phone):
