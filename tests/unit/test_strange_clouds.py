@@ -676,6 +676,13 @@ def test_a_glb_has_the_colours_of_older_and_of_shining_materials(tmp_path, kind,
     assert "not read" not in capsys.readouterr().out
 
 
+def test_the_colour_of_a_glb_s_material_is_light_and_brighter_in_pictures(tmp_path):
+    """Blender writes middle grey, 128 in a picture, as 0.216 (glTF 2.0, 3.9.2)."""
+    grey = {"pbrMetallicRoughness": {"baseColorFactor": [0.2158605, 1, 0, 1]}}
+    glb(tmp_path / "a.glb", lambda document: document.update(materials=[grey]))
+    assert (read_cloud(tmp_path / "a.glb").colors == [128, 255, 0]).all()
+
+
 def test_a_glb_whose_texture_is_webp_alone(tmp_path):
     def change(document):
         document["textures"] = [{"extensions": {"EXT_texture_webp": {"source": 0}}}]

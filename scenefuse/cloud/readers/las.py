@@ -57,8 +57,7 @@ def las_dimensions(path: Path) -> list[str]:
         points = next(iter(file.chunk_iterator(AT_ONCE)), None)
     if points is None:
         return []
-    form = points.point_format
-    names = [name for name in form.standard_dimension_names if name.lower() not in (*POSITION, *COLOR)]
+    names = [n for n in points.point_format.standard_dimension_names if n.lower() not in (*POSITION, *COLOR)]
     values = {name: np.asarray(points[name]) for name in names}
     differing = {name for name in names if values[name].min() != values[name].max()}
     return [name for name in names if name in differing or (name == "classification" and values[name].any())]

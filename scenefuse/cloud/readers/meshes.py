@@ -84,8 +84,8 @@ def sampled_columns(mesh: Mesh) -> Columns:
     """
     if mesh.faces.size and (mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices)):
         raise ValueError("its faces name vertices that it does not have")
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
+    first = mesh.vertices[mesh.faces[:, 0]]
+    cross = np.cross(mesh.vertices[mesh.faces[:, 1]] - first, mesh.vertices[mesh.faces[:, 2]] - first)
     double = np.nan_to_num(np.linalg.norm(cross, axis=1), posinf=0.0)
     ends = np.cumsum(double)
     if not len(ends) or ends[-1] == 0:
@@ -96,7 +96,8 @@ def sampled_columns(mesh: Mesh) -> Columns:
     u, v = ((np.arange(1, count + 1) * step) % 1 for step in (0.7548776662466927, 0.5698402909980532))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     weights = np.stack([1 - u - v, u, v], axis=1)
-    points = a[face] + u[:, None] * (b - a)[face] + v[:, None] * (c - a)[face]
+    a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
+    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
     columns: Columns = dict(zip("xyz", points.T)) | dict(
         zip(("nx", "ny", "nz"), (cross[face] / double[face, None]).T.astype(np.float32))
     )
@@ -492,11 +493,9 @@ class _Gltf:
 
     def colors(self, accessor: int) -> Array:
         """(N, 3) colours of vertices, 0..255. glTF's are linear (2.0, 3.9.2), as Blender writes them in 16 bits; what
-        trimesh and Open3D write as bytes and real numbers is as in pictures (IEC 61966-2-1)."""
+        trimesh and Open3D write as bytes and real numbers is as in pictures."""
         shares = self.values(accessor)[:, :3]
-        if _kind(self.document["accessors"][accessor]) != np.uint16:
-            return 255 * shares
-        return 255 * np.where(shares <= 0.0031308, 12.92 * shares, 1.055 * shares ** (1 / 2.4) - 0.055)
+        return _as_in_pictures(shares) if _kind(self.document["accessors"][accessor]) == np.uint16 else 255 * shares
 
     def stored(self, about: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> NDArray[Any]:
         """(N, K) numbers that lie in a buffer."""
@@ -523,7 +522,7 @@ class _Gltf:
 
     def material(self, number: int) -> Material:
         """A material's colour and picture."""
-        color = tuple(255 * part for part in self.painted(number)[1][:3])
+        color = tuple(np.rint(_as_in_pictures(np.array(self.painted(number)[1][:3], float))))
         texture = self.texture(number)
         if "index" not in texture:
             return Material(None, color)
@@ -543,6 +542,11 @@ class _Gltf:
         place[:2, 2] = texture.get("offset", [0, 0])
         down = np.array([[1.0, 0, 0], [0, -1.0, 1], [0, 0, 1]])  # glTF counts from the upper edge
         return Material(picture, color, (down @ place)[:2])
+
+
+def _as_in_pictures(shares: Array) -> Array:
+    """Linear colours, 0..1, as pictures have them, 0..255 (IEC 61966-2-1)."""
+    return 255 * np.where(shares <= 0.0031308, 12.92 * shares, 1.055 * shares ** (1 / 2.4) - 0.055)
 
 
 def _poses(parts: dict[str, Array]) -> Array:
