@@ -137,7 +137,7 @@ def locate_clicks(labels: Clicks, sparse: Path, scene: TiledCloud) -> SceneClick
             name = f"{'inside' if inside else 'outside'} ({pixel[0]:.0f}, {pixel[1]:.0f}) in {view.name}"
             # Beside an object outside clicks are of the ground, however far apart the object's points lie.
             reach = farthest if inside else CELL_SPACINGS * step
-            found = _on_surface(tree, np.abs(pixels - pixel).max(1), depth, step, reach, view)
+            found = _on_surface(tree, np.abs(pixels - pixel).max(1), depth, step, reach, view) if tree.n else None
             if found is None:
                 left_out.append(f"the click {name} of {labels.path} meets no point of the scene: left out")
             else:

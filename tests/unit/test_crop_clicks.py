@@ -222,3 +222,9 @@ def test_clicks_outside_on_the_ground_beside_a_wall_leave_the_wall(count, noise)
     )
     assert other[:count].mean() < 0.08 and (np.linalg.norm(ground - [5, -0.7, 0], axis=1) < 1)[other[count:]].any()
     assert other[count:][np.linalg.norm(ground - [5, -0.7, 0], axis=1) < 0.6].all()
+
+
+def test_clicks_where_the_photo_shows_nothing_of_the_scene_are_an_error(crop):
+    level = photo(np.array([0, -30.0, 1]))
+    with pytest.raises(StageError, match="has 0 clicks inside the object that meet points of the scene"):
+        crop([("inside", (x, 3.0)) for x in (100, 300, 500, 700)], view=level)
