@@ -178,20 +178,15 @@ def grabcut(image: NDArray[np.uint8], trimap: Trimap, width_px: int, iterations:
     size = (max(8, round((right - left) * scale)), max(8, round((bottom - top) * scale)))
     picture = cv2.resize(image[top:bottom, left:right], size, interpolation=cv2.INTER_AREA)
     picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-    labels = cv2.resize(trimap[top:bottom, left:right], size, interpolation=cv2.INTER_NEAREST)
-    certain = (
-        ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).sum(),
-        ((labels == cv2.GC_BGD) | (labels == cv2.GC_PR_BGD)).sum(),
-    )
+    labels = np.asarray(cv2.resize(trimap[top:bottom, left:right], size, interpolation=cv2.INTER_NEAREST), np.uint8)
+    own = np.count_nonzero(labels & cv2.GC_FGD)  # GC_PR_FGD has that bit too
     # GrabCut learns five colours of each side and needs pixels to learn from.
-    if min(certain) >= 10:
+    if min(own, labels.size - own) >= 10:
         models = np.zeros((1, 65)), np.zeros((1, 65))
         cv2.setRNGSeed(0)
         cv2.grabCut(picture, labels, (0, 0, 1, 1), models[0], models[1], iterations, cv2.GC_INIT_WITH_MASK)
-    found = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.float32)
-    mask = np.zeros((height, width), dtype=bool)
-    found = cv2.resize(found, (right - left, bottom - top), interpolation=cv2.INTER_LINEAR)
-    mask[top:bottom, left:right] = found > 0.5
+    mask, small = np.zeros((height, width), dtype=bool), (labels & cv2.GC_FGD).astype(np.float32)
+    mask[top:bottom, left:right] = cv2.resize(small, (right - left, bottom - top)) > 0.5
     return mask
 
 

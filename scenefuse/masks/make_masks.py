@@ -32,7 +32,7 @@ from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.sam2_weights import WEIGHTS, why_unavailable
 from scenefuse.masks.segmentation import MaskSettings, Prompted, ScoredMasks, masks_from_prompts, score_masks
 from scenefuse.masks.target import target_from_points
-from scenefuse.masks.votes import points_in_masks
+from scenefuse.masks.votes import in_masks, points_in_masks
 from scenefuse.mvs.undistort import undistort_picture
 from scenefuse.photos.cameras.given import QUARTERS
 from scenefuse.photos.frames import original_sizes
@@ -199,11 +199,28 @@ def _network(settings: MaskSettings) -> tuple[Sam2 | None, dict[str, Any]]:
     return network, {"method": quantity("sam2", "")}
 
 
-def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Workspace, dict[str, str]]:
-    """Supplied masks (H, W), the photos they belong to, and why the other photos have none."""
+Supplied = tuple[list[Mask], Workspace, dict[str, str]]
+"""Supplied masks (H, W), the photos they belong to, and why the other photos have none."""
+
+
+def _supplied(inputs: MaskInputs, photos: Workspace) -> Supplied:
+    """The supplied masks. Those of photos that were stored upside down may be so, too: they are turned where more
+    sparse points then lie in all masks, as their shape does not tell."""
+    turned = orientations_in(read_json(inputs.photos_json))
+    ways = [_on_their_sides(turned), turned] if turned != _on_their_sides(turned) else [turned]
+    made = [_supplied_as(inputs, photos, way) for way in ways]
+    return max(made, key=lambda one: len(in_masks(one[1], one[0])))
+
+
+def _on_their_sides(turned: dict[str, int]) -> dict[str, int]:
+    """The orientations of photos without those that were stored upside down."""
+    return {name: orientation for name, orientation in turned.items() if QUARTERS.get(orientation) != 2}
+
+
+def _supplied_as(inputs: MaskInputs, photos: Workspace, turned: dict[str, int]) -> Supplied:
+    """The supplied masks, those of photos that were turned so taken to lie as these did."""
     if inputs.supplied is None:
         raise StageError("method supplied needs a folder of masks; set its path in config/objects.tsv")
-    turned = orientations_in(read_json(inputs.photos_json))
     found, unusable = supplied_masks(inputs.supplied, inputs.sparse, photos.views, turned)
     require_white_object(found.values(), inputs.supplied)
     missing = {view.name: "no mask was supplied" for view in photos.views if view.name not in found}
@@ -218,7 +235,7 @@ def _kept(made: ScoredMasks, keep: str, inputs: MaskInputs, views: list[View]) -
     """The part of the masks that an expression keeps; their agreement stays that of the whole object."""
     masks, dropped, others = {}, dict(made.dropped), {}
     for folder in mask_folders(keep):
-        turned = orientations_in(read_json(inputs.photos_json))
+        turned = _on_their_sides(orientations_in(read_json(inputs.photos_json)))
         others[folder], unusable = supplied_masks(folder, inputs.sparse, views, turned)
         dropped = unusable | dropped
     for name, mask in made.masks.items():
@@ -284,7 +301,8 @@ def supplied_masks(
             or smaller than its photo.
         sparse: COLMAP model of the original photos, before undistortion.
         views: the undistorted photos.
-        turned: EXIF orientation of the photos that were stood upright: their masks may still lie as they are stored.
+        turned: EXIF orientation of the photos that were stood upright: their masks may still lie as they are stored,
+            those of photos that were upside down do.
 
     Raises:
         StageError: no such folder, masks that belong to none of the photos, or none that is usable.

@@ -277,9 +277,8 @@ def masks_from_prompts(
         return Prompted(masks, target, found.reasons, left_out, tuple(found.notes), names, found.quality)
     points, exact, left_out, notes = _points(marked, sparse, sizes, settings.max_click_residual_px)
     target = replace(target_from_points(points, photos, up, seed), inexact=np.flatnonzero(~exact))
-    if network:
-        return Prompted(segment_by_sam2(network, target, photos, settings), target, {}, left_out, notes)
-    return Prompted(segment_by_grabcut(target, photos, settings), target, {}, left_out, notes)
+    by = partial(segment_by_sam2, network) if network else segment_by_grabcut
+    return Prompted(by(target, photos, settings), target, {}, left_out, notes)
 
 
 def _points(

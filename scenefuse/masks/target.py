@@ -144,7 +144,7 @@ def upright_box(points: Array, up: Array, margin: float) -> Box:
     """The smallest upright box around (N, 3) points, its third axis along `up`, grown on all sides.
 
     Args:
-        points: points on the object, at least two, in the object's frame.
+        points: points on the object, at least three, in the object's frame.
         up: (3,) the direction against gravity.
         margin: growth on each side, as a share of the diagonal of the box of the points.
     """
@@ -153,11 +153,9 @@ def upright_box(points: Array, up: Array, margin: float) -> Box:
     x /= np.linalg.norm(x)
     axes = np.stack([x, np.cross(z, x), z], axis=1)
     flat = points @ axes
-    if len(points) >= 3:
-        angle = np.radians(cv2.minAreaRect((flat - flat.mean(0))[:, :2].astype(np.float32))[2])
-        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-        axes = axes @ turn
-        flat = points @ axes
+    angle = np.radians(cv2.minAreaRect((flat - flat.mean(0))[:, :2].astype(np.float32))[2])
+    axes = axes @ np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    flat = points @ axes
     low, high = flat.min(0), flat.max(0)
     grow = margin * np.linalg.norm(high - low)
     return Box(np.column_stack([axes, np.zeros(3)]), low - grow, high + grow)

@@ -170,12 +170,12 @@ def points_in_masks(photos: Workspace, masks: list[Mask]) -> Array:
     Raises:
         StageError: there are fewer than ten of them.
     """
-    own = _in_masks(photos, masks)
+    own = in_masks(photos, masks)
     if len(own) < MIN_OWN_POINTS:
         # It loads PyTorch, which the page to click in does without.
         from scenefuse.mvs.stereo_points import with_stereo_points
 
-        own = _in_masks(with_stereo_points(photos), masks)
+        own = in_masks(with_stereo_points(photos), masks)
     if len(own) < MIN_OWN_POINTS:
         raise StageError(
             f"only {len(own)} points, those by stereo included, lie in the supplied masks; "
@@ -184,7 +184,7 @@ def points_in_masks(photos: Workspace, masks: list[Mask]) -> Array:
     return without_outermost(own)
 
 
-def _in_masks(photos: Workspace, masks: list[Mask]) -> Array:
+def in_masks(photos: Workspace, masks: list[Mask]) -> Array:
     """(N, 3) points that lie in nearly all of the masks (H, W) of the photos that see them."""
     seen, hit = np.zeros(len(photos.points)), np.zeros(len(photos.points))
     for rows, pixels, mask in zip(photos.seen, photos.seen_at, masks):

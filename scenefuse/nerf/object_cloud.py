@@ -99,9 +99,8 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
     """
     use_threads(threads())
     saved = read_nerf(inputs.stage)
-    known = {"nerf_from_object": read_json(inputs.stage_json)["nerf_from_object"]}
-    if up := read_json(inputs.workspace_json).get("up_in_camera_frame"):
-        known["up_in_camera_frame"] = up
+    of = {"nerf_from_object": inputs.stage_json, "up_in_camera_frame": inputs.workspace_json}
+    known = {name: read_json(path)[name] for name, path in of.items()}
     views = _views(inputs, saved["names"])
     maps = read_maps(inputs.stage, views, settings.gates.min_confidence)
     rendered = max(int((maps.depths > 0).sum()), 1)

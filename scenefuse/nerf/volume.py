@@ -31,6 +31,7 @@ MARGIN = 0.02
 MIN_FRAMING_OF_HULL = 0.3
 # The first, rough cube is wider by this share on each side than the masks' extents ask for, or the object's own points.
 ROUGH_MARGIN = 0.25
+EMPTY_HULL = "the visual hull of the masks is empty: masks and cameras contradict each other; check both"
 
 
 @dataclass(frozen=True)
@@ -56,15 +57,12 @@ def find_volume(
     Raises:
         StageError: fewer than two photos, or no cell is left.
     """
-    try:
-        if cube is None:
-            rough = _rough_cube([outline.view for outline in outlines], own)
-            cube = tight_cube(visual_hull(outlines, rough, FIRST_CELLS, tolerance, own), rough, MARGIN)
-        hull = visual_hull(outlines, cube, cells, tolerance, own)
-    except ValueError as error:
-        raise StageError(f"no volume for the object: {error}; check the masks and the cameras") from None
+    if cube is None:
+        rough = _rough_cube([outline.view for outline in outlines], own)
+        cube = tight_cube(visual_hull(outlines, rough, FIRST_CELLS, tolerance, own), rough, MARGIN)
+    hull = visual_hull(outlines, cube, cells, tolerance, own)
     if not hull.any():
-        raise StageError("the visual hull of the masks is empty: masks and cameras contradict each other; check both")
+        raise StageError(EMPTY_HULL)
     return Volume(cube, hull)
 
 
@@ -135,7 +133,7 @@ def cube_from_cameras(views: list[View]) -> Sim3:
     Its centre is the point nearest to the viewing rays of the masks' centres; its size follows from their extents.
 
     Raises:
-        ValueError: fewer than two photos.
+        StageError: fewer than two photos.
     """
     normal, right, centres, angles = np.zeros((3, 3)), np.zeros(3), [], []
     for view in views:
@@ -150,7 +148,7 @@ def cube_from_cameras(views: list[View]) -> Sim3:
         centres.append(view.centre)
         angles.append(0.5 * np.hypot(np.ptp(box[0]) / view.intrinsics[0, 0], np.ptp(box[1]) / view.intrinsics[1, 1]))
     if len(centres) < 2:
-        raise ValueError("fewer than two photos with a mask of the object are trained on")
+        raise StageError(f"{len(centres)} photos with a mask of the object are trained on, two are needed; add some")
     center = np.linalg.solve(normal, right)
     radius = max(np.percentile(np.linalg.norm(np.array(centres) - center, axis=1) * np.array(angles), 90), 1e-9)
     scale = 0.5 / ((1 + 2 * ROUGH_MARGIN) * radius)
@@ -161,11 +159,11 @@ def tight_cube(hull: NDArray[np.bool_], unit_from_object: Sim3, margin: float) -
     """The cube around a hull's cells, `margin` (share of its side) wider on each side: nerf_from_object.
 
     Raises:
-        ValueError: the hull is empty.
+        StageError: the hull is empty.
     """
     cells = np.argwhere(hull)
     if len(cells) == 0:
-        raise ValueError("the visual hull of the masks is empty")
+        raise StageError(EMPTY_HULL)
     low, high = cells.min(0) / len(hull), (cells.max(0) + 1) / len(hull)
     object_from_unit = unit_from_object.inverse()
     center = object_from_unit.apply((low + high) / 2)

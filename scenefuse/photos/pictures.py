@@ -75,7 +75,7 @@ def require_white_object(masks: Iterable[NDArray[np.bool_]], source: object) -> 
 
 def read_supplied_mask(file: Path, size: tuple[int, int], quarters: int = 0) -> NDArray[np.bool_]:
     """A mask (H, W), of any size, of a photo of this (width, height); turned by these clockwise quarters, as its photo
-    was, where it has the shape of before.
+    was, where it has the shape of before, and by two in any case.
 
     Raises:
         StageError: it cannot be read, or is of another picture.
@@ -87,7 +87,7 @@ def read_supplied_mask(file: Path, size: tuple[int, int], quarters: int = 0) -> 
             f"the mask {file} cannot be read ({str(error).split(';')[0]}); export it again as PNG, white on"
             " the object and black elsewhere"
         ) from None
-    if quarters % 2 and same_shape(mask.shape, size) and not same_shape(mask.shape, size[::-1]):
+    if quarters == 2 or quarters and same_shape(mask.shape, size) and not same_shape(mask.shape, size[::-1]):
         mask = np.rot90(mask, -quarters)
     (height, width), (photo_width, photo_height) = mask.shape, size
     if not same_shape((width, height), size):

@@ -256,6 +256,20 @@ def test_masks_of_photos_as_they_are_stored_are_turned_with_these(capture, tmp_p
     assert min(iou_with_truth(capture, tmp_path)) > 0.999
 
 
+@pytest.mark.parametrize("stored", [True, False])
+def test_masks_of_photos_that_were_upside_down_lie_as_the_points_say(capture, tmp_path, stored):
+    shutil.copytree(capture, tmp_path / "capture")
+    write_json(tmp_path / "capture/photos.json", {"photos": [], "turned": {"value": {"f0.png": 3, "f5.png": 3}}})
+    truth = {}
+    for k in range(PHOTOS):
+        file = tmp_path / f"capture/truth/f{k}_mask.png"
+        truth[k] = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        truth[k][: HEIGHT // 2] = 0
+        cv2.imwrite(str(file), truth[k][::-1, ::-1] if stored and k in (0, 5) else truth[k])
+    run_stage(tmp_path / "capture", tmp_path, method="supplied", prompts=None, supplied=tmp_path / "capture/truth")
+    assert all((cv2.imread(str(tmp_path / f"masks/f{k}.png"), 0) == truth[k]).all() for k in range(PHOTOS))
+
+
 def test_the_one_mask_that_disagrees_with_the_visual_hull_is_left_out_and_no_other(capture, tmp_path):
     supplied = tmp_path / "supplied"
     shutil.copytree(capture / "truth", supplied)

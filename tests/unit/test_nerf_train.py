@@ -70,7 +70,7 @@ def test_masks_without_a_common_volume_give_an_empty_hull(sphere):
     _, masks, k, poses, _ = sphere
     empty = silhouettes(masks & False, None, k, poses)
     assert not visual_hull(empty, Sim3.identity(), 32, 0.0).any()
-    with pytest.raises(ValueError, match="fewer than two photos"):
+    with pytest.raises(StageError, match="1 photos with a mask of the object are trained on, two are needed"):
         cube_from_cameras([outline.view for outline in silhouettes(masks[:1], None, k[:1], poses[:1])])
 
 
