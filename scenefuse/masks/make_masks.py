@@ -177,7 +177,7 @@ def _with_disputed(made: ScoredMasks, found: Prompted, min_photos: int) -> tuple
         return made, found
     note = (
         f"fewer than {min_photos} masks agree with each other: those of {', '.join(sorted(disputed))} are used although"
-        " they do not; look at them, and click in a photo whose mask is wrong"
+        " they do not; look at them, and correct those that are wrong, or click in their photos"
     )
     dropped = {name: why for name, why in made.dropped.items() if name not in disputed}
     return replace(made, dropped=dropped), replace(found, notes=(*found.notes, note))

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from scenefuse.core.settings import build, read_settings
+from scenefuse.core.settings import build, problem, read_settings, schema_of
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.geometry.surface import ends_of
 from scenefuse.mvs.photo_refinement import RefinementSettings
@@ -76,6 +76,8 @@ def train_nerf(
     start = time.perf_counter()
     settings = read_settings(config)
     seed = settings["seed"] if seed is None else seed
+    if wrong := problem({"seed": seed, "object": {"stage2": {"epochs": epochs}}}, schema_of("config")):
+        raise StageError(f"--{wrong.rpartition('.')[2]}; correct it")
     wanted = settings["object"]
     _clear(out)
     workspace, mattes, photos_json = out / "undistorted", out / "masks", out / "steps/photos.json"

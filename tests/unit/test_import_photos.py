@@ -503,6 +503,8 @@ def test_exact_masks_have_no_band_that_is_left_out():
         ({"out": Path("file.txt")}, "is a file"),
         ({"masks": Path("none")}, "--masks none is no folder"),
         ({"config": Path("typo.yaml")}, "'levls' is unknown; did you mean 'levels'"),
+        ({"seed": -1}, "--seed: -1 is less than the minimum of 0; correct it"),
+        ({"epochs": 0}, "--epochs: 0 is less than the minimum of 1; correct it"),
     ],
 )
 def test_wrong_flags_are_one_sentence(tmp_path, monkeypatch, options, words):
