@@ -62,10 +62,10 @@ def columns_in_parts(path: Path, degrees: bool = False) -> ColumnParts:
     """
     reader, ending = READERS.get(path.suffix.lower()), path.suffix.lower()
     if path.is_dir():
-        raise StageError(f"{path} is a folder; give the path of a cloud ({', '.join(READERS)})")
+        raise StageError(f"{path} is a folder; give one cloud, its tiles merged into a file ({', '.join(READERS)})")
     if reader is None:
         raise StageError(
-            f"{path}: '{path.suffix}' is no known ending of a cloud or mesh; convert it to one of {', '.join(READERS)}"
+            f"{path}: '{path.suffix}' is no cloud's ending; unpack or convert it to one of {', '.join(READERS)}"
         )
     if not path.is_file():
         raise StageError(f"{path} does not exist; give the path of a cloud ({', '.join(READERS)})")

@@ -277,7 +277,7 @@ def test_longitude_and_latitude_without_a_word_are_refused(tmp_path, cloud):
         ("a.xyz", "", r"is empty \(0 bytes\)"),
         ("a.xyz", "1 2 3\n" * 300, "only 1 different positions among its 300 points; 200 or more are needed"),
         ("a.xyz", "nan nan nan\n" * 300, "300 rows without a finite position"),
-        ("a.dwg", "", r"'\.dwg' is no known ending"),
+        ("a.dwg", "", r"'\.dwg' is no cloud's ending"),
         ("a.laz", "LASF", "not a readable LAZ cloud"),
     ],
     ids=["empty", "one point", "NaN", "unknown ending", "cut short"],

@@ -178,7 +178,7 @@ def test_a_glb_stands_upright_at_its_place(tmp_path):
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "none of its faces has an area"),
         ("a.obj", "", r"is empty \(0 bytes\)"),
         ("a.glb", "solid", "not a readable GLB cloud .*does not begin as glTF does"),
-        ("a.fbx", "x", r"'\.fbx' is no known ending of a cloud or mesh; convert it to one of \.ply, \.obj, \.glb"),
+        ("a.zip", "x", r"'\.zip' is no cloud's ending; unpack or convert it to one of \.ply, \.obj, \.glb"),
     ],
     ids=["no such vertex", "no area", "empty", "no GLB", "unknown ending"],
 )
@@ -186,6 +186,11 @@ def test_a_bad_mesh_is_one_sentence(tmp_path, name, content, sentence):
     (tmp_path / name).write_text(content)
     with pytest.raises(StageError, match=sentence):
         read_cloud(tmp_path / name)
+
+
+def test_a_folder_of_tiles_is_one_sentence(tmp_path):
+    with pytest.raises(StageError, match="is a folder; give one cloud, its tiles merged into a file"):
+        read_cloud(tmp_path)
 
 
 def test_a_compressed_glb_says_so(tmp_path):
