@@ -57,7 +57,7 @@ class Compared:
 
     Attributes:
         added: (N,) of the object's points that come into the scene.
-        contradicted: (N,) of the object's points that are not measured, those that photos see through.
+        contradicted: (N,) of the object's points that are not measured and have texture, those that photos see through.
         reason: (M,) uint8 of the scene's points: Reason.KEPT, or why it is taken away.
     """
 
@@ -89,7 +89,8 @@ def compare(obj: Measured, scene: Measured, disputed: Mask, views: list[View], s
     reason[through & ~scene.surface] = Reason.SEEN_THROUGH
 
     sides = [surface, scene.cloud[scene.surface]]
-    both, contradicted = concatenate(sides), ~obj.surface
+    # Where photos show no texture they do not show a surface behind, which they measured by its texture.
+    both, contradicted = concatenate(sides), ~obj.surface & obj.matches.textured
     loose = obj.cloud.points[contradicted]
     # In cells as fine as one side's points the other, sparser one has holes.
     behind = [see(loose, both, views, spacing(side.points), MARGIN * diagonal).through for side in sides]

@@ -157,6 +157,7 @@ def _report(missing: Missing, plan: Plan) -> dict[str, Any]:
     return {
         "status": quantity("found", ""),
         "missing": quantity(sum(shares.values()), "of the object's surface"),
+        "plain": quantity(missing.plain, "of the object's surface"),
         **{name: quantity(share, "of the object's surface") for name, share in shares.items()},
         "stations": quantity(len(plan.stations), ""),
         "stations_show": quantity(sum(station.shows for station in plan.stations), "of never seen and contradicted"),

@@ -77,7 +77,7 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
         outputs: see FusionOutputs. Clouds have the fields `source` (0 scene, 1 object), `photos` (that confirm the
             point), `match` (mean NCC of the best), `deviation` (one standard deviation, the file's unit),
             `world_deviation` (the same; of the object's points with the uncertainty of its pose), `evidence` (0 not
-            checked, 1 measured, 2 NeRF or given cloud only, 3 stereo only).
+            checked, 1 measured, 2 NeRF or given cloud only, 3 stereo only, 4 plain).
         settings: see FusionSettings.
     """
     use_threads(threads())
@@ -160,7 +160,7 @@ def possible(settings: FusionSettings, object_photos: bool, scene_photos: bool) 
         note = (
             "the object has no photos: what the scene's neither confirm nor contradict is added where nothing else is"
         )
-        return replace(settings, nerf_only=True), [note]
+        return replace(settings, unconfirmed="all"), [note]
     note = "neither side has photos: no point is checked; the object's points fill what the scene lacks, by distance"
     return replace(settings, mode="fill"), [note]
 
@@ -215,6 +215,7 @@ def _report(
         "removed_points": quantity(len(fused.removed), "points"),
         "added_points": quantity(len(fused.added), "points"),
         "ground_points": quantity(fused.ground, "points"),
+        "plain_points": quantity(int((fused.added.fields["evidence"] == Evidence.PLAIN).sum()), "points"),
         "nerf_only_points": quantity(unconfirmed, "points"),
         "settled_by": quantity(None if checked is None else checked.moved, "diagonals"),
         "fill_distance": quantity(fused.same_distance, unit),

@@ -27,6 +27,7 @@ class Evidence(IntEnum):
     MEASURED = 1
     NERF_ONLY = 2
     STEREO_ONLY = 3
+    PLAIN = 4
 
 
 FIELDS = ("photos", "match", "deviation", "world_deviation", "evidence")

@@ -19,7 +19,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import UP, Array, look_at
 from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, THROUGH_SHARE
-from scenefuse.fuse.measure import NEAR, RESOLUTION
+from scenefuse.fuse.measure import NEAR, RESOLUTION, Evidence
 from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS, MIN_AGREEING, see, shown_in
 from scenefuse.geometry.photo_check import Photos, match_in
 from scenefuse.geometry.photo_kernel import GOOD_ANGLE
@@ -62,18 +62,27 @@ class Missing:
         cells: centres of its cells, with normals towards empty space and the field `missing`, a value of `Lack`.
         side: of a cell, unit of the frame.
         covered_cells: cells of the object's surface that the completed scene has.
+        plain_cells: of these, those where it has only plain points.
         notes: what a user should know.
     """
 
     cells: Cloud
     side: float
     covered_cells: int
+    plain_cells: int
     notes: tuple[str, ...]
 
     def share(self, kind: int) -> float:
         """Share of the object's surface that is missing for this reason."""
-        total = self.covered_cells + len(self.cells)
-        return float((self.cells.fields["missing"] == kind).sum()) / max(1, total)
+        return self._share(int((self.cells.fields["missing"] == kind).sum()))
+
+    @property
+    def plain(self) -> float:
+        """Share of the object's surface that is there and plain."""
+        return self._share(self.plain_cells)
+
+    def _share(self, cells: int) -> float:
+        return cells / max(1, self.covered_cells + len(self.cells))
 
 
 def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Photos], masks: list[View]) -> Missing:
@@ -84,7 +93,7 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
 
     Args:
         obj: the object's whole cloud in the scene's frame, with normals.
-        completed: the completed scene around it, with normals.
+        completed: the completed scene around it, with normals and the field `evidence`.
         photos: the object's and the scene's, in the scene's frame.
         masks: the object's cameras in the scene's frame with masks (H, W) as pixels; none leaves the second out.
     """
@@ -115,7 +124,12 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     cells.fields["missing"] = _classes(cells, surface, photos, step, margin)
     few = f"{len(masks)} masks: what they do not frame is unknown, only points of the object's own cloud are looked at"
     notes = (few,) if len(masks) < CONFIRMING_PHOTOS else ()
-    return Missing(cells, side, int(grid.hold(obj.points[~apart]).sum()), notes)
+    covered = obj.points[~apart]
+    nearest = cKDTree(completed.points).query(covered, workers=threads())[1] if len(covered) else []
+    evidence = completed.fields.get("evidence", np.zeros(len(completed)))
+    is_plain = evidence[nearest] == Evidence.PLAIN
+    plain = grid.hold(covered[is_plain]) & ~grid.hold(covered[~is_plain])
+    return Missing(cells, side, int(grid.hold(covered).sum()), int(plain.sum()), notes)
 
 
 class _Cells:

@@ -27,10 +27,12 @@ from scenefuse.fuse.measure import (
     with_evidence,
     with_normals,
 )
+from scenefuse.fuse.plain import plain_points
 from scenefuse.fuse.settle import settle
 from scenefuse.fuse.write import GAINS, MIN_PAIRS, SEAM_SPACINGS, Changes, feathered, with_colors_of
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, moved_photos
 
+Unconfirmed = Literal["plain", "all", "none"]
 # Points of the scene around an object that are checked; of a denser scene a random choice, which the others follow.
 MAX_CHECKED = 1_000_000
 
@@ -45,8 +47,9 @@ class FusionSettings:
     of the scene's points on it."""
     match_colors: bool = setting(True)
     """Whether the object's colours get a gain and bias per channel from the overlap."""
-    nerf_only: bool = setting(False)
-    """Whether points of the object that no photo confirms are added where nothing else is (`evidence` only)."""
+    unconfirmed: Unconfirmed = setting("plain")
+    """Points of the object that no photo confirms, added where nothing else is (`evidence` only): those too plain to
+    match that continue what photos confirm; all that photos do not see through; or none."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +140,7 @@ def fuse_by_evidence(
     certain = None if on_scene is None else on_scene.size(obj.diagonal)
     rows = np.flatnonzero(around(scene, obj))
     near = scene[rows]
-    checked = check(obj, near, obj_photos, scene_photos, settings.nerf_only, certain, on_world)
+    checked = check(obj, near, obj_photos, scene_photos, settings.unconfirmed, certain, on_world)
     step = spacing(near.points)
     fill = SAME_PLACE_SPACINGS * step
     moved, gain, bias = with_colors_of(checked.obj, near, fill, settings.match_colors)
@@ -159,7 +162,7 @@ def check(
     scene: Cloud,
     obj_photos: Photos,
     scene_photos: Photos,
-    nerf_only: bool,
+    unconfirmed: Unconfirmed,
     certain: float | None = None,
     on_world: Array | None = None,
 ) -> Checked:
@@ -173,7 +176,7 @@ def check(
         scene: the scene's points around it.
         obj_photos: of the object, in the scene's frame.
         scene_photos: of the scene.
-        nerf_only: whether points of the object that no photo confirms are added where the scene has none.
+        unconfirmed: points of the object that no photo confirms, added where the scene has none.
         certain: how certain the registration was; see `settle`.
         on_world: see `fuse_by_evidence`.
     """
@@ -199,9 +202,10 @@ def check(
     views = obj_photos.views + scene_photos.views
     decided = compare(mine, theirs, disputed, views, len(chosen) / max(len(scene), 1))
     added, reason = decided.added, decided.reason
-    if nerf_only:
-        unconfirmed = ~mine.surface & ~decided.contradicted
-        added = added | gaps(mine.cloud.points, unconfirmed, added, theirs.cloud.points[reason == Reason.KEPT])
+    plain = plain_points(mine, decided.contradicted)
+    if unconfirmed != "none":
+        wanted = plain if unconfirmed == "plain" else ~mine.surface & ~decided.contradicted
+        added = added | gaps(mine.cloud.points, wanted, added, theirs.cloud.points[reason == Reason.KEPT])
     known = with_evidence(theirs, Evidence.STEREO_ONLY)
     if len(chosen) < len(scene):
         notes.append(
@@ -213,6 +217,7 @@ def check(
         reason = reason[nearest]
     of_pose = 0.0 if on_world is None else deviations_of_pose(mine.cloud, on_world, obj.points.mean(0))
     own = with_evidence(mine, Evidence.NERF_ONLY, of_pose)
+    own.fields["evidence"][plain] = Evidence.PLAIN
     return Checked(settled, moved, own, added, decided.contradicted, known, reason, notes)
 
 

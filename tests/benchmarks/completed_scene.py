@@ -119,7 +119,7 @@ def fusions(modes: tuple[str, ...]) -> dict[str, FusionSettings]:
     for mode in get_args(get_type_hints(FusionSettings)["mode"]):
         found[mode] = FusionSettings(mode=mode)
         if mode == "evidence":
-            found["evidence, nerf_only"] = FusionSettings(mode=mode, nerf_only=True)
+            found |= {f"evidence, {u}": FusionSettings(mode=mode, unconfirmed=u) for u in ("none", "all")}
     if unknown := set(modes) - set(found):
         raise StageError(f"there are no rows {sorted(unknown)}; there are {', '.join(found)}")
     return {name: settings for name, settings in found.items() if not modes or name in modes}
@@ -231,7 +231,7 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
     neither. A surface has no place along itself: an axis counts where the surface faces it within 45 degrees.
     """
     folder = case.results / "objects" / case.name
-    evidence, fused = read_json(folder / "evidence.json"), read_cloud(folder / "fused.ply")
+    fused = read_cloud(folder / "fused.ply")
     settled = Sim3.from_matrix(np.array(value(read_json(folder / "fusion.json"), "scene_from_object")))
     truth_from_scene = case.known.fit.truth_from_model @ settled.inverse()
     added = fused[fused.fields["source"] == Source.OBJECT]
@@ -243,11 +243,12 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
     world = in_world.apply(added.points[measured])
     world_bounds = 2 * in_world.scale * added.fields["world_deviation"][measured]
     whole = case.known.fit.truth_from_model.apply(case.object.points)
-    total, nerf_only = (value(evidence, f"object_{name}") for name in ("points", "nerf_only"))
+    plain = added.fields["evidence"] == Evidence.PLAIN
     yield {
         "added": len(added),
         "measured": float(measured.mean()),
-        "nerf_only_of_object": nerf_only / total,
+        "plain": float(plain.mean()),
+        "plain_within_1pct": _share_near(truth_from_scene.apply(added.points[plain]), case.known),
         "deviation_median_over_diagonal": float(np.median(bounds)) / 2 / case.known.diagonal,
         "shift_pct": 100 * float(np.linalg.norm(points.mean(0) - placed.mean(0))) / case.known.diagonal,
         **{f"{axis}_within_2_sd": share for axis, share in zip("xyz", _within(points, bounds, case.known))},

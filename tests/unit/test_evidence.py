@@ -47,14 +47,14 @@ def far():
 @pytest.mark.slow
 def test_the_sharper_side_stays_where_both_measured(near, far):
     obj, scene = sheet(-0.8, 0.4, 0.03), sheet(-0.4, 0.8, 0.06, noise=0.005)
-    found = check(obj, scene, near, far, nerf_only=False)
+    found = check(obj, scene, near, far, unconfirmed="none")
     assert found.added.mean() > 0.97
     inside, outside = scene.points[:, 0] < 0.3, scene.points[:, 0] > 0.5
     assert (found.reason[inside] == Reason.REPLACED).mean() > 0.95 and (found.reason[outside] == Reason.KEPT).all()
     assert (found.scene.fields["evidence"][outside] == Evidence.MEASURED).mean() > 0.9
     # The other way round the scene is the sharper one, and nothing comes in where it is.
     farther = pack(photographs(8, 9.0, radius=6.0))
-    found = check(scene, obj, farther, near, nerf_only=False)
+    found = check(scene, obj, farther, near, unconfirmed="none")
     assert found.added[scene.points[:, 0] < 0.3].mean() < 0.05 and found.added[scene.points[:, 0] > 0.5].mean() > 0.9
     assert (found.reason == Reason.KEPT).all()
 
@@ -65,7 +65,7 @@ def test_a_cloud_without_normals_is_measured_as_one_with_them(near, far, bare):
     turn = Sim3(1.0, Rotation.random(random_state=0).as_matrix(), np.zeros(3))
     obj, scene = (sheet(*ends, 0.06).transformed(turn) for ends in ((-0.8, 0.4), (-0.4, 0.8)))
     obj, scene = (replace(c, normals=None) if bare == name else c for name, c in (("object", obj), ("scene", scene)))
-    found = check(obj, scene, moved_photos(near, turn), moved_photos(far, turn), nerf_only=False)
+    found = check(obj, scene, moved_photos(near, turn), moved_photos(far, turn), unconfirmed="none")
     assert (found.obj.fields["evidence"] == Evidence.MEASURED).mean() > 0.95 and found.added.mean() > 0.95
     assert (found.scene.fields["evidence"] == Evidence.MEASURED).mean() > 0.95
 
@@ -89,17 +89,17 @@ def test_a_roof_without_normals_is_measured_though_cameras_below_it_are_nearer()
 def test_a_rough_object_does_not_take_the_place_of_a_smooth_scene(near, far):
     rough, smooth = sheet(-0.4, 0.4, 0.015, noise=0.012), sheet(-0.4, 0.4, 0.02)
     of_rough, of_smooth = (np.abs(cloud.points[:, 0]) < 0.3 for cloud in (rough, smooth))
-    found = check(rough, smooth, near, far, nerf_only=False)
+    found = check(rough, smooth, near, far, unconfirmed="none")
     assert (found.reason[of_smooth] == Reason.KEPT).mean() > 0.95 and found.added[of_rough].mean() < 0.02
     # A rough scene gives way to a smooth object.
-    found = check(smooth, rough, near, far, nerf_only=False)
+    found = check(smooth, rough, near, far, unconfirmed="none")
     assert (found.reason[of_rough] != Reason.KEPT).mean() > 0.95 and found.added.mean() > 0.95
 
 
 def test_ground_beside_an_object_stays_where_photos_confirm_it(near, far):
     # The scene's points are six times as far apart as the object's, whose rim they touch.
     obj, scene = sheet(-0.8, 0.0, 0.02), sheet(-0.8, 0.8, 0.12)
-    found = check(obj, scene, near, far, nerf_only=False)
+    found = check(obj, scene, near, far, unconfirmed="none")
     beside = (scene.points[:, 0] > 0.03) & (scene.points[:, 0] < 0.17) & (np.abs(scene.points[:, 1]) < 0.9)
     assert beside.any() and (found.reason[beside] == Reason.KEPT).all()
 
@@ -109,7 +109,7 @@ def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_
     scene = concatenate([sheet(-0.8, 0.8, 0.06), floating])
     above = scene.points[:, 2] > 0.1
     obj = concatenate([sheet(-0.8, 0.8, 0.03), floating])
-    found = check(obj, scene, near, far, nerf_only=True)
+    found = check(obj, scene, near, far, unconfirmed="all")
     middle = np.abs(scene.points[:, 1]) < 0.6
     assert (found.reason[above & middle] == Reason.SEEN_THROUGH).all()
     last = np.arange(len(obj)) >= len(obj) - len(floating)
@@ -132,13 +132,13 @@ def test_what_close_ups_show_and_do_not_confirm_beside_the_object_goes_though_th
     obj, floating = sheet(-1.0, 0.0, 0.01, half=1), sheet(0.01, 0.02, 0.01, z=0.037, half=1)
     floating = floating[np.abs(floating.points[:, 1]) < 0.5]
     scene = concatenate([sheet(-0.2, 0.4, 0.01, half=1), floating])
-    found = check(obj, scene, near, flight, nerf_only=False)
+    found = check(obj, scene, near, flight, unconfirmed="none")
     last = np.arange(len(scene)) >= len(scene) - len(floating)
     gone = found.reason == Reason.DISPUTED
     assert gone[last].mean() > 0.4 and not gone[~last].any()
     assert (found.scene.fields["evidence"][last & gone] == Evidence.MEASURED).mean() > 0.8
     # Photos that resolve no more than the scene's own dispute nothing.
-    assert not (check(obj, scene, flight, near, nerf_only=False).reason == Reason.DISPUTED).any()
+    assert not (check(obj, scene, flight, near, unconfirmed="none").reason == Reason.DISPUTED).any()
 
 
 def test_fewer_than_half_of_the_close_ups_that_are_compared_confirm_nothing(monkeypatch):
@@ -156,7 +156,7 @@ def test_what_the_scene_measured_goes_only_where_something_is_left_beside_it(nea
     obj, scene = sheet(-0.8, 0.4, 0.03), sheet(-0.4, 0.8, 0.06, noise=0.005)
     holed = obj.points[:, 0] > 0.1
     monkeypatch.setattr(compare, "better_measured", lambda *_: (np.ones(len(scene), dtype=bool), holed))
-    found = check(obj, scene, near, far, nerf_only=False)
+    found = check(obj, scene, near, far, unconfirmed="none")
     assert (found.reason[scene.points[:, 0] < 0.0] == Reason.REPLACED).all()
     inside = (scene.points[:, 0] > 0.25) & (scene.points[:, 0] < 0.35) & (np.abs(scene.points[:, 1]) < 0.8)
     assert inside.any() and (found.reason[inside] == Reason.KEPT).all()
@@ -166,9 +166,9 @@ def test_what_the_scene_measured_goes_only_where_something_is_left_beside_it(nea
 def test_of_a_very_dense_scene_some_points_are_checked_and_the_others_follow(near, far, monkeypatch):
     floating = sheet(-0.2, 0.2, 0.03, z=0.3)
     obj, scene = sheet(-0.8, 0.4, 0.03), concatenate([sheet(-0.8, 0.8, 0.02), floating])
-    whole = check(obj, scene, near, far, nerf_only=False)
+    whole = check(obj, scene, near, far, unconfirmed="none")
     monkeypatch.setattr(modes, "MAX_CHECKED", len(scene) // 2)
-    some = check(obj, scene, near, far, nerf_only=False)
+    some = check(obj, scene, near, far, unconfirmed="none")
     assert len(some.reason) == len(some.scene) == len(scene) and set(some.scene.fields) == set(FIELDS)
     assert (some.reason == whole.reason).mean() > 0.97 and (some.added == whole.added).mean() > 0.97
     assert any(f"{len(scene) // 2} were checked" in note for note in some.notes) and some.notes[:-1] == whole.notes
@@ -178,24 +178,24 @@ def test_what_no_photo_confirms_is_told_apart_and_added_only_on_demand(near, far
     blank = sheet(BLANK + 0.15, BLANK + 0.4, 0.03)
     obj = concatenate([sheet(-0.5, 0.5, 0.03), blank])
     scene = concatenate([sheet(-0.5, 0.0, 0.06), sheet(BLANK + 0.4, BLANK + 0.5, 0.06)])
-    found = check(obj, scene, near, far, nerf_only=False)
+    found = check(obj, scene, near, far, unconfirmed="none")
     last = slice(-len(blank), None)
     assert (found.obj.fields["evidence"][last] == Evidence.NERF_ONLY).all() and not found.added[last].any()
     beyond = scene.points[:, 0] > BLANK
     assert (found.scene.fields["evidence"][beyond] == Evidence.STEREO_ONLY).all() and (
         found.reason[beyond] == Reason.KEPT
     ).all()
-    assert check(obj, scene, near, far, nerf_only=True).added[last].mean() > 0.8
+    assert check(obj, scene, near, far, unconfirmed="all").added[last].mean() > 0.8
 
 
 @pytest.mark.slow
 def test_an_object_that_is_a_little_off_is_laid_on_the_scene(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04)
     off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.04]))
-    found = check(obj.transformed(off), scene, moved_photos(near, off), far, nerf_only=False)
+    found = check(obj.transformed(off), scene, moved_photos(near, off), far, unconfirmed="none")
     assert np.abs(found.obj.points[:, 2]).max() < 0.005 and found.moved == pytest.approx(0.04 / obj.diagonal, rel=0.2)
     far_off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.3]))
-    found = check(obj.transformed(far_off), scene, moved_photos(near, far_off), far, nerf_only=False)
+    found = check(obj.transformed(far_off), scene, moved_photos(near, far_off), far, unconfirmed="none")
     assert np.abs(found.obj.points[:, 2] - 0.3).max() < 0.05
 
 
@@ -204,12 +204,12 @@ def test_an_object_whose_pose_is_more_certain_than_the_surfaces_stays(near, far)
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04)
     off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.008]))
     sides = obj.transformed(off), scene, moved_photos(near, off), far
-    stays, settles = (check(*sides, nerf_only=False, certain=certain) for certain in (0.0, 0.1))
+    stays, settles = (check(*sides, unconfirmed="none", certain=certain) for certain in (0.0, 0.1))
     assert stays.moved == 0 and any("more certain" in note for note in stays.notes)
     assert settles.moved > 0.002
     away = Sim3(1.0, np.eye(3), np.array([0, 0, 0.04]))
     sides = obj.transformed(away), scene, moved_photos(near, away), far
-    assert check(*sides, nerf_only=False, certain=0.0).moved > 0.005
+    assert check(*sides, unconfirmed="none", certain=0.0).moved > 0.005
 
 
 @pytest.mark.slow
@@ -250,8 +250,8 @@ def test_one_wrong_camera_changes_little(near, far):
     pose = views[0].cam_from_world.copy()
     pose[:3, 3] += 0.4
     views[0] = replace(views[0], cam_from_world=pose)
-    found = check(obj, scene, pack(views), far, nerf_only=False)
-    good = check(obj, scene, near, far, nerf_only=False)
+    found = check(obj, scene, pack(views), far, unconfirmed="none")
+    good = check(obj, scene, near, far, unconfirmed="none")
     assert good.added.mean() > 0.97 and found.added.mean() > 0.9
     assert np.abs(found.obj.points[found.added][:, 2]).max() < 0.01
 
@@ -322,14 +322,14 @@ def test_a_pot_before_a_wall_stays_where_photos_confirm_it():
     scene = concatenate([sheet(-0.8, 0.8, 0.04), pot])
     # The object is the wall and a sill as high as the pot, so that the pot lies in its box.
     obj = concatenate([sheet(-0.8, 0.8, 0.03), sheet(0.7, 0.8, 0.03, z=0.32)])
-    found = check(obj, scene, photos, flight, nerf_only=False)
+    found = check(obj, scene, photos, flight, unconfirmed="none")
     assert (found.scene.fields["evidence"][-len(pot) :] == Evidence.MEASURED).mean() > 0.95
     assert (found.reason[-len(pot) :] == Reason.KEPT).mean() > 0.95
 
 
 def test_the_objects_points_give_way_to_better_ones_within_a_spacing_only(near):
     obj, scene, far = sheet(-0.8, 0.8, 0.02), sheet(-0.8, 0.8, 0.12), pack(photographs(8, 9.0, radius=6.0))
-    found = check(obj, scene, far, near, nerf_only=False)
+    found = check(obj, scene, far, near, unconfirmed="none")
     inside = np.abs(obj.points[:, :2]).max(1) < 0.6
     distance = np.linalg.norm(obj.points[inside, None, :2] - scene.points[:, :2], axis=2).min(1)
     added = found.added[inside]
@@ -340,7 +340,7 @@ def test_the_objects_points_give_way_to_better_ones_within_a_spacing_only(near):
 def test_of_equals_the_denser_side_stays(near, far):
     coarse, fine = sheet(-0.8, 0.8, 0.04), sheet(-0.8, 0.8, 0.015)
     for obj, scene, added in ((coarse, fine, False), (fine, coarse, True)):
-        found = check(obj, scene, near, near, nerf_only=False)
+        found = check(obj, scene, near, near, unconfirmed="none")
         middle, around = (np.abs(cloud.points[:, :2]).max(1) < 0.6 for cloud in (obj, scene))
         assert (found.added[middle].mean() > 0.95) == added
         assert ((found.reason[around] == Reason.KEPT).mean() < 0.05) == added
@@ -350,7 +350,7 @@ def test_of_equals_the_denser_side_stays(near, far):
 def test_in_a_hole_of_a_denser_scene_the_objects_points_are_added(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.012)
     scene = scene[np.linalg.norm(scene.points[:, :2], axis=1) > 0.08]
-    found = check(obj, scene, near, near, nerf_only=False)
+    found = check(obj, scene, near, near, unconfirmed="none")
     inside, beside = (np.linalg.norm(obj.points[:, :2], axis=1) < r for r in (0.05, 0.5))
     assert found.added[inside].mean() > 0.7 and found.added[beside & (np.abs(obj.points[:, 0]) > 0.2)].mean() < 0.05
 
@@ -358,13 +358,13 @@ def test_in_a_hole_of_a_denser_scene_the_objects_points_are_added(near, far):
 @pytest.mark.slow
 def test_doubles_do_not_make_a_scene_dense(near):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.06)
-    found = check(obj, concatenate([scene] * 10), near, near, nerf_only=False)
+    found = check(obj, concatenate([scene] * 10), near, near, unconfirmed="none")
     assert found.added.mean() > 0.95
 
 
 def test_a_scene_of_which_nothing_is_measured_gives_way(near, far):
     obj, floating = sheet(-0.8, 0.4, 0.03), sheet(-0.2, 0.2, 0.06, z=0.3)
-    found = check(obj, floating, near, far, nerf_only=False)
+    found = check(obj, floating, near, far, unconfirmed="none")
     assert found.added.mean() > 0.9 and (found.reason != Reason.KEPT).mean() > 0.9
 
 
@@ -382,7 +382,7 @@ def test_what_the_scene_did_not_measure_stays_where_the_object_measures_less_exa
 
 
 def known(cloud, deviation, surface=True):
-    """A cloud that photos measured, of that standard deviation."""
+    """A cloud with texture that photos measured, of that standard deviation."""
     nothing = np.zeros(len(cloud))
-    matches = Matches(nothing, nothing, nothing, nothing, nothing + deviation, nothing, nothing)
+    matches = Matches(nothing, nothing, nothing, nothing, nothing + deviation, nothing + 20, nothing)
     return Measured(cloud, matches, np.broadcast_to(surface, len(cloud)))

@@ -316,7 +316,7 @@ def test_fusion_does_what_the_photos_that_there_are_allow():
     wanted = FusionSettings()
     assert possible(wanted, True, False) == possible(wanted, True, True) == (wanted, [])
     settings, notes = possible(wanted, False, True)
-    assert (settings.mode, settings.nerf_only) == ("evidence", True) and "the object has no photos" in notes[0]
+    assert (settings.mode, settings.unconfirmed) == ("evidence", "all") and "the object has no photos" in notes[0]
     settings, notes = possible(wanted, False, False)
     assert settings.mode == "fill" and "neither side has photos" in notes[0]
     assert possible(FusionSettings(mode="replace"), False, False)[0].mode == "replace"

@@ -15,6 +15,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3, look_at
 from scenefuse.fuse.find_missing import POSITION, MissingInputs, MissingOutputs, find_missing, photo_rows
+from scenefuse.fuse.measure import Evidence
 from scenefuse.fuse.missing import Free, Lack, Plan, Station, find_missing_surface, plan_stations
 from scenefuse.geometry.photo_check import pack
 from scenefuse.photos.geodesy import GridFrame, LocalFrame
@@ -111,6 +112,21 @@ def test_points_that_no_photo_confirms_are_told_apart_by_texture(waves, kind):
 
 
 @pytest.mark.slow
+def test_surface_with_plain_points_only_is_there_and_counted_as_plain(half):
+    photos, masks, cloud = half
+    plain = cloud.points[:, 2] > 0.5 * cloud.points[:, 2].max()
+    known = replace(cloud, fields={"evidence": np.where(plain, Evidence.PLAIN, Evidence.MEASURED)})
+    found, without = (find_missing_surface(cloud, c, (photos, NOBODY), masks) for c in (known, cloud))
+    assert (found.covered_cells, found.share(Lack.NEVER_SEEN)) == (
+        without.covered_cells,
+        without.share(Lack.NEVER_SEEN),
+    )
+    assert found.plain == pytest.approx(
+        plain.mean() * found.covered_cells / (found.covered_cells + len(found.cells)), abs=0.03
+    )
+    assert without.plain == 0
+
+
 def test_what_photos_see_through_is_not_missing(half):
     photos, masks, cloud = half
     floating = Cloud(CENTER + [0, RADIUS + 0.4, 0] + 0.2 * (ball(500).points - CENTER), ball(500).normals)

@@ -745,6 +745,12 @@ def test_what_is_there_of_a_cloud_without_masks_is_not_said_of_the_whole_object(
     assert object_facts(row | {"surface_of": "its surface"})["Result"].endswith("completed to 98.0 %")
 
 
+def test_how_much_of_what_is_there_photos_cannot_measure_is_said():
+    row = {"object": "house", "status": "registered", "surface_missing": 0.02, "surface_never_seen": 0.02}
+    said = "98.0 % is there, with 12 % too plain to measure, between measured parts that it continues, 2.0 % is missing"
+    assert object_facts(row | {"surface_plain": 0.123})["Surface"].startswith(said)
+
+
 def test_a_position_is_as_exact_as_what_is_known_of_it_says():
     row = {"scene": "yard", "length_unit": "m", "crs": "EPSG:32632"}
     known = {"control_rms_horizontal_m": 0.02, "gps_rms_horizontal_m": 2.0, "gps_rms_vertical_m": 3.0}

@@ -164,13 +164,13 @@ def own_project(tmp_path, monkeypatch):
 
 
 def test_settings_of_a_row_are_those_of_the_run_with_what_differs(own_project):
-    text = "object: {nerf: {width_px: 640}}\nregistration: {crop: {margin: 0.2}}\nfusion: {nerf_only: true}"
+    text = "object: {nerf: {width_px: 640}}\nregistration: {crop: {margin: 0.2}}\nfusion: {unconfirmed: all}"
     run = {"object": {"nerf": {"levels": 10}}, "registration": {"variants": ["full", "no_crop"]}}
     found = own_project(text, **run)
     shed, barn = found.of("object", "shed"), found.of("object", "barn")
     assert (shed["object"]["nerf"]["width_px"], barn["object"]["nerf"]["width_px"]) == (640, 800)
     assert shed["object"]["nerf"]["levels"] == barn["object"]["nerf"]["levels"] == 10
-    assert shed["fusion"]["nerf_only"] and not barn["fusion"]["nerf_only"]
+    assert [row["fusion"]["unconfirmed"] for row in (shed, barn)] == ["all", "plain"]
     assert found.registration("shed", "full")["crop"]["margin"] == 0.2
     assert found.registration("shed", "no_crop")["crop"] == shed["registration"]["crop"] | {"whole_scene": True}
     assert found.registration("barn", "full")["crop"]["margin"] == 0.05
