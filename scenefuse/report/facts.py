@@ -62,7 +62,7 @@ def object_facts(row: Row) -> dict[str, str]:
         causes = ", ".join(f"{share} {what}" for what, share in zip(WORDS["missing"].values(), kinds) if share)
         cells = f" (in cells of {length(has['surface_cell'], unit)})" if "surface_cell" in has else ""
         whole = "" if has.get("surface_of") in OF_ALL else f" of {has['surface_of']}"
-        plain = f", with {percent(has['surface_plain'])} {WORDS['plain']}" if has.get("surface_plain") else ""
+        plain = f", {percent(has['surface_plain'])} {WORDS['plain']}" if has.get("surface_plain") else ""
         lost = f", {missing} is missing: {causes}" if missing else ""
         facts["Surface"] = f"{there}{whole} is there{cells}{plain}{lost}"
         if has.get("ground_missing"):

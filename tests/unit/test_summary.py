@@ -747,7 +747,7 @@ def test_what_is_there_of_a_cloud_without_masks_is_not_said_of_the_whole_object(
 
 def test_how_much_of_what_is_there_photos_cannot_measure_is_said():
     row = {"object": "house", "status": "registered", "surface_missing": 0.02, "surface_never_seen": 0.02}
-    said = "98.0 % is there, with 12 % too plain to measure, between measured parts that it continues, 2.0 % is missing"
+    said = "98.0 % is there, 12 % as plain surface between measured parts, 2.0 % is missing"
     assert object_facts(row | {"surface_plain": 0.123})["Surface"].startswith(said)
 
 
