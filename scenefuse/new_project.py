@@ -136,6 +136,9 @@ def _source(path: Path, folder: Path, least: int = FIXING_POINTS) -> dict[str, s
     if path.is_dir():
         if folder.resolve().is_relative_to(path.resolve()):
             raise StageError(f"the project {folder} would lie among its photos in {path}; give a folder of its own")
+        clouds = sorted(file.name for file in path.iterdir() if is_cloud(file))
+        if clouds and not any(file.suffix.lower() in SUFFIXES for file in path.rglob("*")):
+            raise StageError(f"{path} holds clouds ({clouds[0]}, ...); give one cloud, its tiles merged into a file")
         if (count := len(photo_files(path))) < least:
             raise StageError(f"{path} holds {count} {'photo' if count == 1 else 'photos'}; {least} or more are needed")
     elif not (is_cloud(path) or suffix in VIDEO_SUFFIXES):

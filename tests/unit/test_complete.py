@@ -204,9 +204,10 @@ def test_a_scene_may_be_a_video(two_folders, workflow):
 
 
 def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
-    for name in ("empty", "filmed"):
+    for name in ("empty", "filmed", "tiles"):
         (two_folders / name).mkdir()
-    Path("filmed/clip.MP4").touch()
+    for file in ("filmed/clip.MP4", "tiles/2.laz", "tiles/1.laz"):
+        Path(file).touch()
     Path("notes.txt").write_text("Flight of 12 May\nwindy\n")
     write_cloud(Path("none.ply"), Cloud(np.zeros((0, 3))))
     Path("page.ply").write_text("<html>")
@@ -215,6 +216,7 @@ def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
     for folder, sentence in (
         ("empty", "the photo folder empty holds no photos"),
         ("filmed", r"filmed holds no photos; .*\(or give a video itself: filmed/clip.MP4\)"),
+        ("tiles", r"tiles holds clouds \(1.laz, ...\); give one cloud, its tiles merged into a file"),
         ("notes.txt", r"notes.txt is not a readable TXT cloud \(none of its first lines holds three numbers"),
         ("none.ply", "none.ply holds no points; look at what wrote it"),
         ("page.ply", "page.ply is not a readable PLY cloud"),
