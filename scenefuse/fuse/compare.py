@@ -237,9 +237,20 @@ def _smooth(points: Array, deviation: Array) -> Array:
     return np.median(deviation[near.reshape(len(points), -1)], axis=1)
 
 
-def gaps(points: Array, wanted: Mask, added: Mask, scene: Array) -> Mask:
-    """(N,) of the wanted points those where neither the added ones nor the scene have any."""
-    there = np.concatenate([points[added], scene])
-    if len(there) == 0 or not wanted.any():
+def gaps(obj: Cloud, wanted: Mask, added: Mask, scene: Cloud) -> Mask:
+    """(N,) of the wanted points those beside which, along the surface, neither the added ones nor the scene have any:
+    before or behind them within RESOLUTION is the same place."""
+    there, rows = concatenate([obj[added], scene]), np.flatnonzero(wanted)
+    if len(there) == 0 or not len(rows):
         return wanted
-    return wanted & ~within(points, there, SAME_PLACE_SPACINGS * spacing(points))
+    assert obj.normals is not None and there.normals is not None
+    tree, reach = cKDTree(there.points), RESOLUTION * obj.diagonal
+    distance, near = tree.query(obj.points[rows], NEIGHBOURS, distance_upper_bound=reach, workers=threads())
+    near = np.minimum(near, len(there) - 1).ravel()
+    own = np.repeat(rows, NEIGHBOURS)
+    alike = (obj.normals[own] * there.normals[near]).sum(1) > 0
+    beside = _beside(obj.points[own], there[near]) <= SAME_PLACE_SPACINGS * spacing(obj.points)
+    same = (np.isfinite(distance.ravel()) & alike & beside).reshape(-1, NEIGHBOURS).any(1)
+    found = wanted.copy()
+    found[rows[same]] = False
+    return found

@@ -205,7 +205,7 @@ def check(
     plain = plain_points(mine, decided.contradicted)
     if unconfirmed != "none":
         wanted = plain if unconfirmed == "plain" else ~mine.surface & ~decided.contradicted
-        added = added | gaps(mine.cloud.points, wanted, added, theirs.cloud.points[reason == Reason.KEPT])
+        added = added | gaps(mine.cloud, wanted, added, theirs.cloud[reason == Reason.KEPT])
     known = with_evidence(theirs, Evidence.STEREO_ONLY)
     if len(chosen) < len(scene):
         notes.append(
