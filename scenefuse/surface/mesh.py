@@ -46,6 +46,8 @@ class FaceClass(IntEnum):
     """Beside points that photos confirm."""
     BRIDGED = 2
     """Interpolated over a gap."""
+    PLAIN = 3
+    """Beside plain points."""
 
 
 @dataclass(frozen=True)
@@ -106,13 +108,15 @@ def make_mesh(cloud: Cloud, views: list[View], photos: Photos | None = None) -> 
     cloud = with_normals(cloud, views)
     points, faces, normals = _poisson(cloud, step)
     tree = cKDTree(cloud.points)
-    confirmed = cloud.fields.get("evidence", np.zeros(len(cloud))) == Evidence.MEASURED
+    evidence = cloud.fields.get("evidence", np.zeros(len(cloud), np.uint8))
+    known = np.zeros(len(cloud), np.uint8)
+    known[evidence == Evidence.MEASURED], known[evidence == Evidence.PLAIN] = FaceClass.MEASURED, FaceClass.PLAIN
     middle = points[faces].mean(1)
     distance, nearest = tree.query(middle, workers=threads())
     near = distance <= _reach(cloud, tree)[nearest]
     low, high, beyond = cloud.points.min(0), cloud.points.max(0), MAX_GAP / 2 * cloud.diagonal
     inside = ((middle >= low - beyond) & (middle <= high + beyond)).all(1)
-    classes = np.where(near & confirmed[nearest], FaceClass.MEASURED, FaceClass.UNCONFIRMED)
+    classes = np.where(near, known[nearest], np.uint8(FaceClass.UNCONFIRMED))
     if photos is not None:
         tried = np.flatnonzero(inside & ~near)
         of_faces = replace(cloud[nearest[tried]], points=middle[tried], normals=normals_of(points[faces[tried]]))
@@ -130,8 +134,8 @@ def make_mesh(cloud: Cloud, views: list[View], photos: Photos | None = None) -> 
     deviation = fields.get("deviation", np.full(len(cloud), np.nan, np.float32))[own]
     vertices.fields["evidence"] = fields.get("evidence", np.zeros(len(cloud), np.uint8))[own]
     of_vertex = np.full(len(points), FaceClass.BRIDGED, np.uint8)
-    # A vertex is measured if any of its faces is, else unconfirmed if any is.
-    for kind in (FaceClass.UNCONFIRMED, FaceClass.MEASURED):
+    # A vertex is measured if any of its faces is, else plain if any is, else unconfirmed.
+    for kind in (FaceClass.UNCONFIRMED, FaceClass.PLAIN, FaceClass.MEASURED):
         of_vertex[faces[kept & (classes == kind)]] = kind
     vertices.fields["deviation"] = np.where(of_vertex == FaceClass.BRIDGED, np.nan, deviation).astype(np.float32)
     vertices.fields["class"] = of_vertex

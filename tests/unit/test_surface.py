@@ -86,6 +86,7 @@ def closed():
     """The surface of a sphere with a narrow gap at its top, whose lower half photos do not confirm."""
     cloud = with_hole(sphere(STEP), NARROW)
     cloud.fields["evidence"][cloud.points[:, 2] < 0] = Evidence.NERF_ONLY
+    cloud.fields["evidence"][cloud.points[:, 2] < -0.7] = Evidence.PLAIN
     return make_mesh(cloud, [])
 
 
@@ -134,19 +135,18 @@ def test_a_cloud_that_holds_every_point_twice_has_the_surface_of_once():
     assert areas == pytest.approx([4 * np.pi] * 2, rel=0.05)
 
 
-def test_what_no_photo_confirms_is_told_apart(closed):
+def test_what_no_photo_confirms_is_told_apart_and_of_this_what_is_plain(closed):
     height = closed.vertices.points[closed.faces].mean(1)[:, 2]
-    assert (closed.classes[height < -2 * STEP] == FaceClass.UNCONFIRMED).all()
+    assert (closed.classes[(height < -2 * STEP) & (height > -0.7 + 2 * STEP)] == FaceClass.UNCONFIRMED).all()
+    assert (closed.classes[height < -0.7 - 2 * STEP] == FaceClass.PLAIN).all()
     assert (closed.classes[(height > 2 * STEP) & (away(closed) > 0.1)] == FaceClass.MEASURED).all()
 
 
 def test_shares_of_the_classes_sum_to_the_whole_area(closed):
     report = surface_report(closed, "m")
-    shares = [value(report, name) for name in ("measured", "unconfirmed", "bridged", "open")]
-    assert sum(shares) == pytest.approx(1)
-    assert sum(value(report, f"{n}_area") for n in ("measured", "unconfirmed", "bridged")) == pytest.approx(
-        4 * np.pi, rel=0.02
-    )
+    closed_by = ("measured", "plain", "unconfirmed", "bridged")
+    assert sum(value(report, name) for name in (*closed_by, "open")) == pytest.approx(1)
+    assert sum(value(report, f"{name}_area") for name in closed_by) == pytest.approx(4 * np.pi, rel=0.02)
 
 
 def plate_over_ground() -> Cloud:
