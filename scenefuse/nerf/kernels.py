@@ -287,7 +287,8 @@ def _place(r, jitter, shares, near_count, used, step, buffers, out):
         edge = end
 
 
-@_jit
+# Without fast-math, which gave other last bits where it was just compiled than out of the cache.
+@nb.njit(parallel=True, cache=True)
 def march(rays, occupancy, jitter, uniform, prior, out):
     """Importance samples along rays through an occupancy grid.
 
