@@ -732,6 +732,20 @@ def test_a_mirrored_node_keeps_its_outside_and_its_texture(tmp_path):
     assert (red, blue) == pytest.approx([-0.25, -0.75], abs=0.01) and np.allclose(normal, [0, -1, 0])
 
 
+def test_a_glb_of_points_alone_is_its_points(tmp_path):
+    glb(tmp_path / "a.glb", lambda document: document["meshes"][0]["primitives"][0].update(mode=0))
+    assert read_cloud(tmp_path / "a.glb").points.tolist() == [[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]]
+
+
+def test_children_of_a_glb_without_scenes_are_there_once(tmp_path):
+    def change(document):
+        document.pop("scenes")
+        document.update(nodes=[{"mesh": 0}, {"children": [0], "translation": [5, 0, 0]}])
+
+    glb(tmp_path / "a.glb", change)
+    assert read_cloud(tmp_path / "a.glb").points[:, 0].min() >= 5
+
+
 def test_instances_strips_fans_and_sparse_corners_of_glb(tmp_path):
     def instances(document):
         about = {"attributes": {"TRANSLATION": 4, "ROTATION": 5}}

@@ -243,8 +243,7 @@ def read_obj(path: Path) -> Columns:
     table = np.array(vertices).reshape(-1, 6)
     painted = np.isfinite(table[:, 3:]).all(1)
     if not lengths:
-        columns: Columns = dict(zip("xyz", table[:, :3].T))
-        return columns | dict(zip(COLOR, bytes_of(table[:, 3:]).T)) if painted.all() else columns
+        return _points(table[:, :3], bytes_of(table[:, 3:]) if painted.all() else None)
     corners, of = triangles(np.array(lengths), np.array(rows), table[:, :3])
     files = [file for name in libraries for file in _libraries(path.parent, name)]
     known = dict(pair for file in files for pair in _materials(file).items())
@@ -258,6 +257,14 @@ def read_obj(path: Path) -> Columns:
             tuple(known.get(name, Material()) for name in names) if known else (),
         )
     )
+
+
+def _points(vertices: Array, colors: NDArray[Any] | None) -> Columns:
+    """Vertices (V, 3) of a file without faces; colours 0..255 where all have one."""
+    columns: Columns = dict(zip("xyz", vertices.T))
+    if colors is None or not np.isfinite(colors).all():
+        return columns
+    return columns | dict(zip(COLOR, np.rint(colors).astype(np.uint8).T))
 
 
 def _obj_lines(path: Path) -> Iterator[str]:
@@ -362,10 +369,10 @@ def _picture(content: bytes, name: str) -> NDArray[np.uint8] | None:
 
 def read_gltf(path: Path) -> Columns:
     """glTF 2.0, in one file (GLB) or JSON with files beside it: all meshes of its scene at their places, turned so that
-    z is up (glTF says that y is).
+    z is up (glTF says that y is); where it has points alone, these.
 
     Raises:
-        ValueError: it is no glTF, holds no triangles, or its meshes are compressed.
+        ValueError: it is no glTF, holds neither triangles nor points, or its meshes are compressed.
     """
     content = _Gltf.of(path)
     document = content.document
@@ -376,22 +383,26 @@ def read_gltf(path: Path) -> Columns:
         print(f"note: {path.name} uses {', '.join(unread)}, which is not read", flush=True)
     upright = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
     scenes, nodes = document.get("scenes"), document.get("nodes", [])
-    roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
+    tops = {*range(len(nodes))}.difference(*(node.get("children", []) for node in nodes))
+    roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else sorted(tops)
     parts = [part for root in roots for part in content.parts(root, upright)]
     if not parts:
-        raise ValueError("it holds no triangles")
+        raise ValueError("it holds no triangles and no points")
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
     colors = [np.full(part.vertices.shape, np.nan) if part.colors is None else part.colors for part in parts]
-    return sampled_columns(
-        Mesh(
-            np.concatenate([part.vertices for part in parts]),
-            np.concatenate([part.faces + start for part, start in zip(parts, starts)]),
-            None if all(part.colors is None for part in parts) else np.concatenate(colors),
-            np.concatenate([np.full((len(p.faces), 3, 2), np.nan) if p.uvs is None else p.uvs for p in parts]),
-            np.concatenate([part.material for part in parts]),
-            tuple(content.material(number) for number in range(len(document.get("materials", [])))),
-        )
+    mesh = Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, starts)]),
+        None if all(part.colors is None for part in parts) else np.concatenate(colors),
+        np.concatenate([np.full((len(p.faces), 3, 2), np.nan) if p.uvs is None else p.uvs for p in parts]),
+        np.concatenate([part.material for part in parts]),
+        tuple(content.material(number) for number in range(len(document.get("materials", [])))),
     )
+    if not len(mesh.faces):
+        return _points(mesh.vertices, mesh.colors)
+    if not all(len(part.faces) for part in parts):
+        print("note: points of the glTF are left out; triangles are read", flush=True)
+    return sampled_columns(mesh)
 
 
 @dataclass(frozen=True)
@@ -438,7 +449,7 @@ class _Gltf:
         for primitive in self.document["meshes"][about["mesh"]]["primitives"] if "mesh" in about else []:
             faces = self.faces(primitive)
             if faces is None:
-                print("note: lines and points of the glTF are left out; triangles are read", flush=True)
+                print("note: lines of the glTF are left out", flush=True)
                 continue
             names, number = primitive["attributes"], primitive.get("material", -1)
             vertices = self.values(names["POSITION"])
@@ -455,7 +466,7 @@ class _Gltf:
         return found + [part for child in about.get("children", []) for part in self.parts(child, pose)]
 
     def faces(self, primitive: dict[str, Any]) -> NDArray[np.int64] | None:
-        """The triangles (F, 3) of triangles, a strip or a fan (glTF 2.0, 3.7.2.1); None of lines and points."""
+        """The triangles (F, 3) of triangles, a strip or a fan (glTF 2.0, 3.7.2.1), none of points; None of lines."""
         count = self.document["accessors"][primitive["attributes"]["POSITION"]]["count"]
         index = np.arange(count)
         if "indices" in primitive:
@@ -463,8 +474,8 @@ class _Gltf:
             if index.size and index.max() >= count:
                 raise ValueError("its faces name vertices that it does not have")
         mode, each = primitive.get("mode", 4), np.arange(len(index) - 2)
-        if mode == 4:
-            return index[: len(index) // 3 * 3].reshape(-1, 3)
+        if mode in (0, 4):
+            return index[: len(index) // 3 * 3 if mode else 0].reshape(-1, 3)
         if mode == 5:
             return of_strip(index)
         return index[np.stack([each + 1, each + 2, np.zeros_like(each)], axis=1)] if mode == 6 else None
