@@ -119,8 +119,10 @@ def fill(table: Path, column: str, cells: Mapping[str, str]) -> None:
 
 
 def default_name(path: Path) -> str:
-    """A name for the tables from that of a file or folder; letters lose their accents."""
+    """A name for the tables from that of a file or folder; letters lose their accents, other scripts become Punycode."""
     letters = "".join(a for a in unicodedata.normalize("NFKD", _stem(path)) if not unicodedata.combining(a))
+    if not letters.isascii() and not re.search("[A-Za-z]", letters):
+        letters = letters.encode("punycode").decode()
     return re.sub(r"[^A-Za-z0-9_-]+", "_", letters).strip("-_") or "_"
 
 

@@ -333,6 +333,13 @@ def test_init_ends_with_the_next_command_by_its_real_names_and_says_how_many_pho
     assert "`scenefuse pick --object close`" in Path("yard/README.md").read_text()
 
 
+def test_folders_in_other_scripts_have_names_of_their_own(two_folders):
+    for name in ("房子", "Дом 1", "Сарай 1", "Größe"):
+        Project(two_folders).photos(name)
+    init(Path("yard"), scene=Path("flight"), objects=(Path("房子"), Path("Дом 1"), Path("Сарай 1"), Path("Größe")))
+    assert list(read_table(Path("yard/config/objects.tsv"), "object"))[::3] == ["i8s34n", "Gro_e"]
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
