@@ -119,7 +119,7 @@ def fill(table: Path, column: str, cells: Mapping[str, str]) -> None:
 
 
 def default_name(path: Path) -> str:
-    """A name for the tables from that of a file or folder; letters lose their accents, other scripts become Punycode."""
+    """A name for the tables from that of a file or folder: without accents; in other scripts, as Punycode."""
     letters = "".join(a for a in unicodedata.normalize("NFKD", _stem(path)) if not unicodedata.combining(a))
     if not letters.isascii() and not re.search("[A-Za-z]", letters):
         letters = letters.encode("punycode").decode()
