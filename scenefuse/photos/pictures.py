@@ -43,13 +43,13 @@ def read_raw(path: Path) -> NDArray[Any]:
 
 
 def matte_of(picture: NDArray[Any]) -> NDArray[np.bool_]:
-    """A mask picture as (H, W) bool: alpha where it varies, else brightness, above half of the largest value.
+    """A mask picture as (H, W) bool: alpha where it divides the picture, else brightness, above half its largest value.
 
     Raises:
         StageError: most of what it shows is grey, as of a photo, cut out on black or not, or it has areas of several
             values or colours, as of labels: of two where these are as bright as each other.
     """
-    if picture.ndim == 3 and picture.shape[2] == 4 and picture[..., 3].min() < picture[..., 3].max():
+    if picture.ndim == 3 and picture.shape[2] == 4 and picture[..., 3].min() <= picture[..., 3].max() / 2:
         picture = picture[..., 3]
     elif picture.ndim == 3:
         picture = picture[..., :3]

@@ -369,6 +369,9 @@ def test_a_mask_with_a_soft_edge_or_of_one_label_is_one(tmp_path, ending):
         cv2.imwrite(str(tmp_path / f"a.{ending}"), mask)
         if ending == "png" or mask.max() > 1:
             assert np.mean(matte_of(read_raw(tmp_path / f"a.{ending}")) != disc) < 0.01
+    opaque = np.full(disc.shape, 254, np.uint8)
+    opaque[0] = 255
+    assert (matte_of(np.dstack([soft, soft, soft, opaque])) == (soft > 127)).all()
 
 
 def test_the_angles_of_view_give_focal_lengths_across_and_upwards(tmp_path):
