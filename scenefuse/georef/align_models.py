@@ -323,7 +323,7 @@ def pose_by_gps(
         return None
     rotations, centres = (part[[row_of[names[k]] for k in known]] for part in _cameras(obj))
     target, sd_m = frame.apply(positions[known]), float(np.median(gps_accuracies(listed, accuracy_m)[known, 0]))
-    up = estimate_up(rotations, centres)[0]
+    up = estimate_up(rotations, centres, target)[0]
     placed = place_by_gps(centres, target, up, GeoreferenceSettings(True, accuracy_m), seed, sd_m)
     if placed.status != "georeferenced":
         return None

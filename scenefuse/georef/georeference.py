@@ -93,7 +93,10 @@ def georegister(
     model, listed = read_model(sparse), read_photos(photos)
     names, rotations, centres = camera_poses(model)
     gps = gps_cameras(names, centres, listed, settings.gps_accuracy_m)
-    up, cue = estimate_up(rotations, centres)
+    there = np.full(centres.shape, np.nan)
+    if settings.use_gps and gps.names:
+        there[np.isin(names, gps.names)] = local_frame(gps.positions).apply(gps.positions)
+    up, cue = estimate_up(rotations, centres, there)
     surveyed = None if control is None else read_control_points(control, model, listed)
     place = read_place(read_json(sparse_json))
     if place is not None and surveyed is None:

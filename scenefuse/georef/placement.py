@@ -156,7 +156,8 @@ def place_by_control(
         )
     agree = whole & inliers
     check_spread(there[agree], [n for n, a in zip(names, agree) if a], where)
-    if fitted.rotate(up)[2] < 0:
+    # Swapped axes turn it by half a turn; what photos say of up may be a quarter off.
+    if fitted.rotate(up)[2] < -0.5:
         raise StageError(
             f"{where}: the control points turn the model upside down, as swapped axes do; x has to be easting or"
             " longitude, y northing or latitude"

@@ -15,7 +15,7 @@ MIN_ROLL_DEG = 1.0
 UNSURE_CUES = ("image up", "viewing direction", "few headings")
 
 
-def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
+def estimate_up(world_from_cam: Array, centres: Array, there: Array | None = None) -> tuple[Array, str]:
     """The direction opposite to gravity, and the cue it comes from.
 
     Photos are mostly held level: a camera's x axis is horizontal whatever its heading and pitch. Where headings
@@ -24,13 +24,15 @@ def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
     around that line; it is then the mean image-up side, or opposite to the mean viewing direction, whichever of the two
 
     - keeps more cameras from standing on their head (a flight back along the next strip turns photos by 180 degrees),
-    - else lets the camera centres move less along it (flights and walks keep their height).
+    - else lets the camera centres move less along it (flights and walks keep their height), or, where GPS gives
+      heights, leaves less of these: photos of a facade, row above row, look like those of a flight in strips.
 
     One nadir strip and a walk along a wall, both straight, look the same; the walk is assumed.
 
     Args:
         world_from_cam: (N, 3, 3) camera rotations, OpenCV axes, in the order of the photos.
         centres: (N, 3) camera centres, in any unit.
+        there: (N, 3) positions by GPS in metres, the last column upwards; NaN where unknown.
 
     Returns:
         (3,) unit vector in the world frame, and "headings", "few headings", "image up" or "viewing direction".
@@ -50,10 +52,22 @@ def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
     upright = {cue: float(np.mean(-(y @ d) > -0.2)) for cue, d in levelled.items()}
     best = max(upright.values())
     fair = [cue for cue in levelled if upright[cue] > best - 0.2]
-    travel = {cue: float(np.std(centres @ levelled[cue])) for cue in fair}
+    heights = _heights(centres, there)
+    left = {cue: centres @ levelled[cue] - heights for cue in fair}
+    travel = {cue: float(np.nanmedian(np.abs(off - np.nanmedian(off)))) for cue, off in left.items()}
     # Image up comes first in the dictionary, so it wins unless the other is clearly better.
     chosen = min(fair, key=lambda cue: travel[cue] * (1.0 if cue == "image up" else 2.0))
     return levelled[chosen], chosen
+
+
+def _heights(centres: Array, there: Array | None) -> Array:
+    """(N,) heights by GPS in the unit of the centres, NaN where unknown; zeros where half of the photos have none."""
+    if there is not None and (known := np.isfinite(there).all(1)).mean() > 0.5:
+        away = (part[known] - np.median(part[known], axis=0) for part in (centres, there))
+        size, size_m = (float(np.median(np.linalg.norm(part, axis=1))) for part in away)
+        if size_m > 0:
+            return there[:, 2] * size / size_m
+    return np.zeros(len(centres))
 
 
 def roll_spread_deg(world_from_cam: Array, up: Array) -> float:

@@ -66,6 +66,22 @@ def test_up_is_found_in_any_frame(name):
     assert np.degrees(np.arccos(np.clip(up @ world @ UP, -1, 1))) < 3.0
 
 
+def test_heights_by_gps_tell_photos_of_a_facade_from_a_flight_in_strips():
+    rng, turn = np.random.default_rng(0), Rotation.from_euler("xyz", [40, -110, 65], degrees=True).as_matrix()
+    strips = grid(8, 6, 4.0)
+    rows = strips[:, [0, 2, 1]]
+    for centres, pitch, cue in ((rows, 0.0, "image up"), (strips, -90.0, "viewing direction")):
+        rotations = turn @ noisy([camera(90.0, pitch)] * 48, 1.0)
+        positions = centres + rng.normal(0, [1.5, 1.5, 3.0], (48, 3))
+        positions[::5, 2] = np.nan
+        positions[1::9, 2] += 200.0
+        up, found = estimate_up(rotations, 0.1 * centres @ turn.T, positions)
+        assert found == cue and np.degrees(np.arccos(up @ turn @ UP)) < 3.0
+        same = np.full((48, 3), [1.0, 2.0, 3.0])
+        for unknown in (positions * np.nan, same):
+            assert estimate_up(rotations, centres @ turn.T, unknown)[1] == "viewing direction"
+
+
 def test_a_few_photos_on_their_side_do_no_harm():
     rotations, centres = orbit(-20, 360, 30)
     for index in range(0, 30, 6):

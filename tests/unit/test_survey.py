@@ -1,5 +1,6 @@
 """Control and check points, positions with their accuracy, and the adjustment to both, against a planted truth."""
 
+import contextlib
 import csv
 from dataclasses import replace
 
@@ -12,9 +13,9 @@ from PIL.ExifTags import IFD, Base
 from support.surveyed import FRAME, fly, gcp_lines, write_inputs
 
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.georef.control import read_control
+from scenefuse.georef.control import LocatedPoint, SurveyedPoint, read_control
 from scenefuse.georef.georeference import camera_poses, georegister
-from scenefuse.georef.placement import GeoreferenceSettings
+from scenefuse.georef.placement import GeoreferenceSettings, place_by_control
 from scenefuse.marks.triangulation import read_lengths
 from scenefuse.photos.frames import VideoSettings, list_photos
 from scenefuse.photos.geodesy import frame_notes, scene_frame
@@ -333,6 +334,15 @@ def test_swapped_axes_within_one_country_turn_the_model_upside_down(tmp_path, mo
     lines = [swapped(line) for line in gcp_lines(FLIGHT, PLACES * [1, 1, 0.01], NAMES, crs=grid)]
     with pytest.raises(StageError, match="upside down"):
         georeferenced(tmp_path, model, without_gps(), lines)
+
+
+@pytest.mark.parametrize("lean_deg, upright", [(0, True), (100, True), (170, False)])
+def test_photos_that_do_not_say_for_sure_which_way_is_up_contradict_no_control_points(lean_deg, upright):
+    located = [LocatedPoint(SurveyedPoint(n, p, (0.02, 0.03), False, []), p) for n, p in zip(NAMES, PLACES)]
+    up = np.array([0.0, np.sin(np.radians(lean_deg)), np.cos(np.radians(lean_deg))])
+    with contextlib.nullcontext() if upright else pytest.raises(StageError, match="upside down"):
+        placement, _ = place_by_control(located, PLACES, up, "gcp_list.txt", 0)
+        np.testing.assert_allclose(placement.local_from_model.matrix, np.eye(4), atol=1e-9)
 
 
 def test_control_points_along_one_line_are_refused(tmp_path, model):
