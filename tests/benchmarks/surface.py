@@ -111,8 +111,8 @@ def row(results: Path, name: str) -> dict[str, str]:
         "measure": name,
         "completed cloud, F at 0.25 %; 0.5 %; 1 %": f_scores(scores[0]),
         "surface, the same": f_scores(scores[1]),
-        "area measured; unconfirmed; bridged; open (%)": "; ".join(
-            f"{100 * value(report, share):.1f}" for share in ("measured", "unconfirmed", "bridged", "open")
+        "area measured; plain; unconfirmed; bridged; open (%)": "; ".join(
+            f"{100 * value(report, share):.1f}" for share in ("measured", "plain", "unconfirmed", "bridged", "open")
         ),
         "seen surface closed to 0.5; 1 (%)": "; ".join(
             f"{100 * scores[1][at]['recall']:.1f}" for at in ("05pct", "1pct")
