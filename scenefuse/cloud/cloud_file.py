@@ -18,6 +18,7 @@ from scenefuse.cloud.clouds import (
     finite_rows,
     precision_note,
     quick_tree,
+    sampled_rows,
     spacing,
     voxel_downsample,
     voxels,
@@ -28,6 +29,7 @@ from scenefuse.cloud.readers.columns import (
     COLOR,
     MAX_ODD_SHARE,
     POSITION,
+    UNIT_TOLERANCE,
     Columns,
     color_counts,
     colors_of,
@@ -339,3 +341,27 @@ def without_strays(cloud: Cloud, what: str) -> tuple[Cloud, list[str]]:
     if not far.any():
         return cloud, []
     return cloud[np.flatnonzero(~far)], [f"{far.sum()} points of {what}, far from all others, are left out"]
+
+
+def normals_fault(cloud: Cloud) -> str:
+    """Why a cloud's normals say nothing, in words; "" where nothing is wrong, or there are none.
+
+    Programs fit planes without turning them outwards: then neighbours on one surface face either side. Of right normals
+    a few of a hundred do, at edges and on thin sheets.
+    """
+    fault = lengths_fault(cloud)
+    if fault or cloud.normals is None or not len(cloud):
+        return fault
+    some = sampled_rows(len(cloud), SAMPLE // 100, seed=0)
+    near = quick_tree(cloud.points).query(cloud.points[some], range(1, min(NEIGHBOURS + 1, len(cloud)) + 1))[1]
+    facing = np.einsum("ni,nki->nk", cloud.normals[some], cloud.normals[near])[:, 1:]
+    facing = facing[np.abs(facing) > 0.5]
+    # Where a share of the points is turned, nearly twice as many pairs differ.
+    most = 2 * MAX_ODD_SHARE * (1 - MAX_ODD_SHARE)
+    return "face either side, unlike their neighbours'" if (facing < 0).sum() > most * len(facing) else ""
+
+
+def lengths_fault(cloud: Cloud) -> str:
+    """The same of their lengths alone, as of a part of a file."""
+    lengths = np.ones(1) if cloud.normals is None else np.linalg.norm(cloud.normals, axis=1)
+    return "are not all of unit length" if (np.abs(lengths - 1) > UNIT_TOLERANCE).any() else ""

@@ -19,7 +19,6 @@ from scenefuse.cloud.readers.columns import (
     MAX_ODD_SHARE,
     NORMAL,
     POSITION,
-    UNIT_TOLERANCE,
     Columns,
     bytes_of,
     colors_of,
@@ -232,11 +231,6 @@ def chosen_rows(columns: Columns, chosen: NDArray[np.bool_]) -> tuple[Columns, i
     if chosen.all():
         return columns, 0
     return {name: values[chosen] for name, values in columns.items()}, int(np.sum(~chosen))
-
-
-def has_unit_normals(cloud: Cloud) -> bool:
-    """Whether all normals have unit length; other ones say nothing of the surface."""
-    return cloud.normals is None or bool((np.abs(np.linalg.norm(cloud.normals, axis=1) - 1) <= UNIT_TOLERANCE).all())
 
 
 def precision_note(path: Path, points: NDArray[np.float64], step: float) -> list[str]:

@@ -7,8 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scenefuse.cloud.cloud_file import STRAY_PERCENT, FileSummary, summarise, without_strays
-from scenefuse.cloud.clouds import Cloud, cloud_of, concatenate, has_unit_normals, spacing, write_cloud
+from scenefuse.cloud.cloud_file import (
+    STRAY_PERCENT,
+    FileSummary,
+    lengths_fault,
+    normals_fault,
+    summarise,
+    without_strays,
+)
+from scenefuse.cloud.clouds import Cloud, cloud_of, concatenate, spacing, write_cloud
 from scenefuse.cloud.readers.columns import Columns
 from scenefuse.cloud.readers.las import LAS_DIMENSIONS, WITHHELD, las_crs, las_dimensions
 from scenefuse.cloud.tiled_cloud import open_cloud, write_tiled
@@ -116,13 +123,13 @@ class ImportedFile:
 
     Attributes:
         summary: what is known of all its points.
-        unit_normals: whether there are normals, all of unit length; None where there are none.
+        fault: of its normals, see `normals_fault`; they are left out.
         kept: names of further columns that are taken over.
         unused: names of further columns.
     """
 
     summary: FileSummary
-    unit_normals: bool | None
+    fault: str
     kept: tuple[str, ...]
     unused: list[str]
 
@@ -138,15 +145,15 @@ class ImportedFile:
         Raises:
             StageError: it is missing, damaged, of an unknown ending, or has too few different points.
         """
-        unit_normals, said, names = None, set[str](), set[str]()
+        fault, said, names = None, set[str](), set[str]()
 
         def look(_: Columns, surface: Columns) -> None:
-            nonlocal unit_normals
+            nonlocal fault
             part = cloud_of(surface)
             names.update(part.fields)
             said.update(name for name in {*keep} - said if name in part.fields and part.fields[name].any())
-            if part.normals is not None:
-                unit_normals = unit_normals is not False and has_unit_normals(part)
+            # The first part is as dense as the file; the last may be a few points.
+            fault = normals_fault(part) if fault is None else fault or lengths_fault(part)
 
         whole = summarise(source, look, degrees)
         enough = len(np.unique(whole.sample[:, 0])) >= MIN_POINTS
@@ -157,14 +164,14 @@ class ImportedFile:
             )
         own = set(LAS_DIMENSIONS) if whole.is_las else set[str]()
         unused = (names - own | set(las_dimensions(source))) - own.intersection(keep) - {WITHHELD, ""}
-        return cls(whole, unit_normals, tuple(sorted(said & own)), sorted(unused))
+        return cls(whole, fault or "", tuple(sorted(said & own)), sorted(unused))
 
     def clouds(self) -> Iterator[Cloud]:
         """The points in parts, with unit normals or none, colours as bytes or none, and only the fields kept."""
         for columns in self.summary.columns():
             surface = self.summary.surface(columns)
             cloud, normals = self.summary.cloud(surface), None
-            if self.unit_normals and cloud.normals is not None:
+            if not self.fault and cloud.normals is not None:
                 normals = (cloud.normals / np.linalg.norm(cloud.normals, axis=1, keepdims=True)).astype(np.float32)
             yield replace(cloud, normals=normals, fields={name: surface[name] for name in self.kept})
 
@@ -198,8 +205,8 @@ class ImportedFile:
             more: further notes.
         """
         notes = [*self.summary.notes(points, step), *more]
-        if self.unit_normals is False:
-            notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
+        if self.fault:
+            notes.append(f"its normals {self.fault} and were left out: they are estimated from the points")
         if self.unused:
             notes.append(f"not taken over, and so not in the results: {', '.join(self.unused)}")
         for note in notes:

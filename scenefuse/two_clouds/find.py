@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from scenefuse.cloud.cloud_file import EVERYWHERE
-from scenefuse.cloud.clouds import Cloud, has_unit_normals, read_cloud, sampled_rows
+from scenefuse.cloud.cloud_file import EVERYWHERE, normals_fault
+from scenefuse.cloud.clouds import Cloud, read_cloud, sampled_rows
 from scenefuse.cloud.readers.text import TEXTS
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity
@@ -104,7 +104,7 @@ class Registration:
         scales: the scale prior.
         agreement: fitness, RMSE and normals at the best pose; see `registration_metrics`.
         unit: of the scene's lengths.
-        sides_estimated: whether the object's normals are inwards, and their sides were estimated.
+        sides_estimated: whether normals are inwards, and the sides of both clouds' were estimated.
     """
 
     outcome: Outcome | None
@@ -207,14 +207,16 @@ def find_in_scene(
     scales: ScaleRange | None = None,
     unit: str = "scene units",
     marked: bool = False,
+    estimate_sides: bool = False,
     progress: Callable[[str], None] = lambda line: None,
 ) -> tuple[Registration, Cloud, list[tuple[float, Array]]]:
     """Find where an object lies in a scene that may be thirty times as wide (method R16).
 
     It is searched in the whole scene, as if that showed little else, and in each of `likely_places`; the best coarse
     poses are refined. The best has to lead over those elsewhere as over other poses. Scale, coarse and fine
-    registration and the gate are those of the workflow. Where that finds nothing, and most of the object's normals
-    face its middle, as on a mesh turned inside out, it is searched again with their sides estimated.
+    registration and the gate are those of the workflow. Where that finds nothing, and most normals of the object or of
+    the part of the scene that is most like it face its middle, as on a mesh turned inside out, it is searched again
+    with the sides of all estimated.
 
     Args:
         obj: the object, any frame and unit.
@@ -227,6 +229,7 @@ def find_in_scene(
         scales: scene units per object unit; None to estimate them from both extents.
         unit: what the scene's lengths are counted in, for the report.
         marked: the points are those around fiducials: no parts of it are tried.
+        estimate_sides: the normals of neither are used.
         progress: called with a line before each step that takes long.
 
     Returns:
@@ -237,7 +240,11 @@ def find_in_scene(
         StageError: too few different points, or all in one place or along one line, on either side.
     """
     progress("searching all of it")
-    searched = [(search(obj, scene, settings, seed, ups, scales), scene)]
+
+    def usable(cloud: Cloud) -> Cloud:
+        return replace(cloud, normals=None) if estimate_sides else cloud
+
+    searched = [(search(usable(obj), usable(scene), settings, seed, ups, scales), scene)]
     likely = [] if marked else likely_places(obj, scene, up_in_scene, settings.crop, seed, MAX_PLACES)
     # At a known scale the object may be far larger than a part; grids of nearest points would be as well.
     smallest = 0.0 if scales is None else scales.centre * obj.diagonal / MAX_SIZE_RATIO
@@ -245,7 +252,7 @@ def find_in_scene(
     for number, part in enumerate(parts, 1):
         progress(f"searching part {number} of {len(parts)} that look like the object")
         with contextlib.suppress(StageError):  # too few different points there
-            searched.append((search(obj, part, settings, seed, ups, scales), part))
+            searched.append((search(usable(obj), usable(part), settings, seed, ups, scales), part))
     # The refinement of a pose does not catch up with one that is twice as good.
     least = max(there.total for there, _ in searched) / 2
     best = sorted((one for one in searched if one[0].total >= least), key=lambda one: -one[0].total)
@@ -257,18 +264,23 @@ def find_in_scene(
     found, part = max(tried, key=lambda one: (one[0].registered, one[0].total))
     if len(tried) > 1:
         found = _unless_elsewhere(found, [other for other, _ in tried], obj, settings.fine)
-    inward = None if obj.normals is None else ((obj.points - obj.points.mean(0)) * obj.normals).sum(1) < 0
-    if not found.registered and inward is not None and inward.mean() > 0.5:
-        progress("most normals of the object face inwards: again, with their sides estimated")
+    if not found.registered and not estimate_sides and (_is_inward(obj) or _is_inward(part)):
+        progress("most normals face inwards: again, with their sides estimated")
         other, where, places = find_in_scene(
-            replace(obj, normals=None), scene, settings, seed,
-            ups=ups, up_in_scene=up_in_scene, scales=scales, unit=unit, marked=marked, progress=progress,
+            obj, scene, settings, seed, ups=ups, up_in_scene=up_in_scene, scales=scales, unit=unit, marked=marked,
+            estimate_sides=True, progress=progress,
         )  # fmt: skip
         if other.registered:
             return replace(other, sides_estimated=True), where, places
     ranked = sorted((one for one in tried if one[1] is not scene), key=lambda one: -one[0].total)
     places = [(one.total, np.stack([there.points.min(0), there.points.max(0)])) for one, there in ranked]
     return with_agreement(found, obj, part, settings, seed), part, places
+
+
+def _is_inward(cloud: Cloud) -> bool:
+    """Whether most normals face the middle."""
+    off, normals = cloud.points - cloud.points.mean(0), cloud.normals
+    return normals is not None and bool(((off * normals).sum(1) < 0).mean() > 0.5)
 
 
 def _unless_elsewhere(
@@ -438,5 +450,5 @@ def _fiducials(path: Path) -> tuple[list[str], Array]:
 def _searched(cloud: Cloud, origin: Array, seed: int) -> Cloud:
     """A cloud about an origin (3,), of not too many points, without normals that say nothing: they are estimated."""
     cloud = cloud[np.sort(sampled_rows(len(cloud), SEARCHED_POINTS, seed))]
-    normals = cloud.normals if has_unit_normals(cloud) else None
+    normals = None if normals_fault(cloud) else cloud.normals
     return replace(cloud, points=cloud.points - origin, normals=normals)

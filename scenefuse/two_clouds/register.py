@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from scenefuse.cloud.cloud_file import CloudFile, without_strays
-from scenefuse.cloud.clouds import Cloud, has_unit_normals, write_cloud
+from scenefuse.cloud.cloud_file import CloudFile, normals_fault, without_strays
+from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.cloud.import_cloud import unit_and_name
 from scenefuse.cloud.readers.las import las_crs, las_dimensions
 from scenefuse.cloud.write_las import write_laz
@@ -125,7 +125,8 @@ def register(
         ups=given.ups, up_in_scene=known.ups()[1], scales=scales, unit=unit, marked=marked, progress=_progress,
     )  # fmt: skip
     if found.sides_estimated:
-        notes.append(f"most normals of {object} face inwards: it is found with their sides estimated from the points")
+        inwards = f"most normals of {object} or {scene} face inwards"
+        notes.append(f"{inwards}: it is found with the sides of both estimated from the points")
         print(f"note       {notes[-1]}", flush=True)
     if not marked:
         searched = f"{given.searched}, and the parts of it that look like the object"
@@ -234,9 +235,9 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     part, strays = without_strays(part, f"what is searched of {scene}")
     notes += strays
     for each, path in ((own, object), (part, scene)):
-        if not has_unit_normals(each):
-            notes.append(f"the normals of {path} are not all of unit length: they are estimated from the points")
-    own = own if has_unit_normals(own) else replace(own, normals=None)
+        if fault := normals_fault(each):
+            notes.append(f"the normals of {path} {fault}: they are estimated from the points")
+    own = replace(own, normals=None) if normals_fault(own) else own
     ups = None if up_object is None or up_scene is None else (up_object, up_scene)
     return Given(own, replace(whole, part=part), searched, notes, ups)
 

@@ -6,11 +6,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud import cloud_file, clouds
-from scenefuse.cloud.cloud_file import CloudFile, strays
+from scenefuse.cloud.cloud_file import CloudFile, normals_fault, strays
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3
+from scenefuse.geometry.surface import normals_at
 
 
 def cloud(count: int = 50) -> Cloud:
@@ -184,3 +185,16 @@ def test_of_a_dense_cloud_few_points_are_asked_for_their_neighbours(monkeypatch)
     surface = np.column_stack([rng.uniform(0, 10, (100_000, 2)), rng.normal(0, 0.01, 100_000)])
     found = strays(np.concatenate([surface, rng.uniform(2, 9, (20, 3))]))
     assert not found[:-20].any() and found[-20:].all() and 0 < sum(asked) < 10_000
+
+
+def test_normals_that_face_either_side_are_told_from_those_that_all_face_in_or_out():
+    points = np.random.default_rng(0).normal(size=(3000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    of_planes = normals_at(points, points)  # fitted, and turned to no side
+    at_random = points * np.random.default_rng(1).choice([-1, 1], (3000, 1))
+    few = np.where(np.arange(3000)[:, None] % 20, points, -points)
+    faults = ((points, ""), (-points, ""), (few, ""), (of_planes, "side"), (at_random, "side"), (0 * points, "length"))
+    for normals, fault in faults:
+        found = normals_fault(Cloud(points, normals.astype(np.float32)))
+        assert fault in found and bool(fault) == bool(found)
+    assert normals_fault(Cloud(points[:1], points[:1].astype(np.float32))) == normals_fault(Cloud(points)) == ""

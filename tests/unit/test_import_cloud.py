@@ -75,7 +75,7 @@ def test_a_scene_in_utm_lies_near_its_origin_and_goes_back_to_its_place(tmp_path
     "name", ["a.laz", "a.las", "a.e57", "a.ply", "text.ply", "a.pcd", "text.pcd", "a.xyz", "a.copc.laz"]
 )
 def test_a_file_read_in_parts_gives_the_same_scene(tmp_path, cloud, name, monkeypatch):
-    turned = np.random.default_rng(1).normal(size=(500, 3))
+    turned = np.random.default_rng(1).normal(size=(500, 3)) + [0, 0, 4]
     source = write_as(tmp_path / name, replace(cloud, normals=turned / np.linalg.norm(turned, axis=1, keepdims=True)))
     whole, *jsons = imported_scene(tmp_path, source)
     monkeypatch.setattr("scenefuse.cloud.formats.AT_ONCE", 64)
@@ -188,9 +188,11 @@ def test_rows_without_a_position_and_unused_columns_are_recorded(tmp_path, cloud
 
 
 def test_normals_that_are_none_are_left_out_and_that_is_said(tmp_path, cloud):
-    write_cloud(tmp_path / "a.ply", Cloud(cloud.points, np.zeros((500, 3), np.float32)))
-    found, report, _ = imported_scene(tmp_path, tmp_path / "a.ply")
-    assert found.normals is None and "not all of unit length" in value(report, "notes")[0]
+    up, either = np.tile([0, 0, 1], (500, 1)), np.random.default_rng(0).choice([-1, 1], (500, 1))
+    for normals, fault in ((0 * up, "not all of unit length"), (either * up, "face either side")):
+        write_cloud(tmp_path / "a.ply", Cloud(cloud.points, normals.astype(np.float32)))
+        found, report, _ = imported_scene(tmp_path, tmp_path / "a.ply")
+        assert found.normals is None and fault in value(report, "notes")[0]
 
 
 def test_classes_and_intensities_of_a_laz_are_kept_for_a_scene_and_named_for_an_object(tmp_path, cloud):

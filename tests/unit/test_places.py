@@ -107,14 +107,17 @@ def test_an_object_that_fits_two_places_is_refused(monkeypatch, yard):
     assert chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.79, near))[0].registered
 
 
-def test_an_object_turned_inside_out_is_searched_again_without_the_sides_of_its_normals(monkeypatch, yard):
-    monkeypatch.setattr(register, "search", lambda obj, *known: tried(0.8, [0, 0, 0], obj.normals is None))
+def test_where_normals_face_inwards_on_one_side_it_is_searched_again_without_those_of_either(monkeypatch, yard):
+    monkeypatch.setattr(
+        register, "search", lambda *two: tried(0.8, [0, 0, 0], two[0].normals is None and two[1].normals is None)
+    )
     monkeypatch.setattr(register, "refined", lambda found, *known: found)
     monkeypatch.setattr(register, "with_agreement", lambda found, *known: found)
-    for side, found in ((-1, True), (1, False)):
-        obj = replace(yard.object, normals=side * yard.object.normals)
-        registration = find_in_scene(obj, yard.scene, LITTLE, 0, marked=True)[0]
+    right, wrong = (replace(yard.object, normals=side * yard.object.normals) for side in (1, -1))
+    for obj, scene, found in ((wrong, right, True), (right, wrong, True), (right, right, False)):
+        registration, part, _ = find_in_scene(obj, scene, LITTLE, 0, marked=True)
         assert registration.registered == registration.sides_estimated == found
+        assert part.normals is not None  # which are those of the scene's file
 
 
 def test_an_object_that_fits_nowhere_may_not_be_there(monkeypatch, yard):

@@ -602,6 +602,19 @@ def test_strays_and_normals_that_say_nothing_do_not_count(tmp_path, house, monke
     assert value(content, "inputs")["object_points"] == len(house.object)
 
 
+def test_normals_that_face_either_side_do_not_count_and_that_is_said(tmp_path, house, monkeypatch):
+    searched = registered_at_once(monkeypatch, house.scene_from_object)
+    for name, cloud in (("house", house.object), ("yard", house.scene)):
+        signs = np.random.default_rng(0).choice([-1, 1], (len(cloud), 1)).astype(np.float32)
+        write_cloud(tmp_path / f"{name}.ply", replace(cloud, normals=signs * cloud.normals))
+    files = {"object": tmp_path / "house.ply", "scene": tmp_path / "yard.ply"}
+    register(**files, out=tmp_path / "out")
+    notes = value(read_json(tmp_path / "out/transform.json"), "notes")
+    for name, note in zip(("house", "yard"), notes, strict=True):
+        assert f"{name}.ply face either side" in note
+    assert searched[0][0].normals is None
+
+
 def test_a_las_of_an_old_version_is_completed(tmp_path):
     write_survey(tmp_path / "yard.las", in_scene(sheet(0, 4)))
     las = laspy.convert(laspy.read(tmp_path / "yard.las"), point_format_id=1, file_version="1.1")
