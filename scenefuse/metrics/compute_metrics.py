@@ -6,9 +6,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from scenefuse.cloud.cloud_file import strays
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.fuse.compare import MARGIN
+from scenefuse.fuse.measure import SUPPORT
 from scenefuse.fuse.write import Source
 from scenefuse.metrics.completion import MetricSettings, completion_metrics, completion_of
 from scenefuse.register.score import registration_metrics
@@ -64,8 +67,11 @@ def compute_metrics(
 
 
 def box_size(points: Array) -> list[float]:
-    """Length, width and height of points (N, 3), z up: of the smallest upright box around nearly all of them."""
-    low, high = np.percentile(points, [0.5, 99.5], axis=0)
-    inside = points[((points >= low) & (points <= high)).all(1)]
-    ground_plan = cv2.minAreaRect((inside[:, :2] - low[:2]).astype(np.float32))[1]
-    return [*sorted(map(float, ground_plan), reverse=True), float(high[2] - low[2])]
+    """Length, width and height of points (N, 3), z up: of the smallest upright box around them without strays. What may
+    be ground at the foot, lower than twice MARGIN, counts in the height alone, unless it is most of the object."""
+    points = points[~strays(points)]
+    low, high = points.min(0), points.max(0)
+    above = points[:, 2] > low[2] + 2 * MARGIN * np.linalg.norm(high - low)
+    plan = points[above] if above.mean() > SUPPORT else points
+    sides = cv2.minAreaRect((plan[:, :2] - low[:2]).astype(np.float32))[1]
+    return [*sorted(map(float, sides), reverse=True), float(high[2] - low[2])]

@@ -234,8 +234,10 @@ def test_every_part_of_what_was_added_counts_in_the_surface_variation():
 
 def test_the_size_is_that_of_the_upright_box_however_the_object_stands_in_the_scene():
     rng = np.random.default_rng(0)
-    points = rng.uniform(-0.5, 0.5, (20_000, 3)) * [4, 2, 3]
+    points = rng.uniform(-0.5, 0.5, (20_000, 3)) * [4, 2, 2]
     points[:5] *= 9  # stray points do not make it larger
+    points[5:35] = np.linspace([0, 0, 1], [0, 0, 2], 30)  # a spire does
+    points[35:95] = [0, 0, -1] + np.linspace([0, 0, 0], [0, 3, 0.05], 60)  # ground at its foot does not
     turned = np.radians(30)
     turn = np.array([[np.cos(turned), -np.sin(turned), 0], [np.sin(turned), np.cos(turned), 0], [0, 0, 1]])
     np.testing.assert_allclose(box_size(points @ turn.T + 100.0), [4, 2, 3], rtol=0.05)
