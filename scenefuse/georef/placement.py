@@ -18,7 +18,7 @@ from scenefuse.core.transforms import (
     rotation_between,
 )
 from scenefuse.georef.control import LocatedPoint, check_spread, describe_misses
-from scenefuse.photos.geodesy import MAX_MEDIAN_DISTANCES
+from scenefuse.photos.geodesy import MAX_MEDIAN_DISTANCES, local_frame
 from scenefuse.sfm.gravity import MAX_VERTICAL_SD_DEG
 
 Array = NDArray[np.float64]
@@ -89,32 +89,71 @@ class GpsCameras:
 
 
 def of_one_zero(gps: GpsCameras, least_m: float) -> tuple[GpsCameras, str]:
-    """GPS heights of two flights that count from different zeros, as ellipsoid and sea, brought to that of more photos;
-    and what was done, "" for nothing. Such a step turns the model, and residuals hardly show it.
+    """GPS heights of flights that count from different zeros, as ellipsoid and sea, brought to that of most photos; and
+    what was done, "" for nothing. Such steps turn the model, and residuals hardly show it.
+
+    Steps are tried one after the other, each where it explains most beside those before. They are removed where a third
+    of the positions that contradict the cameras then agree with them: a bent model's heights in steps do less.
 
     Args:
         gps: photos in the order of their names: one flight after the other.
-        least_m: what a step has to exceed. It also has to explain more than half of the squared heights that no
-            similarity does.
+        least_m: what a step has to exceed, and how far a position that agrees is off at most.
     """
-    known = np.flatnonzero(np.isfinite(gps.positions[:, 2]))
-    if len(known) < 4 * PHOTOS_OF_ONE_ERROR:
+    known, few = np.flatnonzero(np.isfinite(gps.positions[:, 2])), PHOTOS_OF_ONE_ERROR
+    if len(known) < 4 * few:
         return gps, ""
-    heights, starts = gps.positions[known, 2], np.arange(PHOTOS_OF_ONE_ERROR, len(known) - PHOTOS_OF_ONE_ERROR + 1)
-    explained = np.linalg.qr(np.c_[gps.centres[known], np.ones(len(known))])[0]
-    off = heights - explained @ (explained.T @ heights)
-    # A step, 1 from a start on, times a column is the sum of that column's end.
-    along, in_explained = (np.cumsum(part[::-1], axis=0)[::-1][starts] for part in (off, explained))
-    sizes = along / np.maximum(len(known) - starts - (in_explained**2).sum(1), 1e-9)
-    at = int(np.argmax(sizes * along))
-    if abs(sizes[at]) <= least_m or sizes[at] * along[at] < off @ off / 2:
-        return gps, ""
-    late = np.arange(len(known)) >= starts[at]
-    few, shift = (late, -sizes[at]) if late.mean() < 0.5 else (~late, sizes[at])
-    positions = gps.positions.copy()
-    positions[known[few], 2] += shift
-    note = f"; GPS heights of {few.sum()} photos are moved by {shift:+.1f} m, to the zero of the others"
-    return replace(gps, positions=positions), note
+    heights, order, starts = gps.positions[known, 2], np.arange(len(known)), np.arange(few, len(known) - few + 1)
+    linear, steps = np.c_[gps.centres[known], np.ones(len(known))], np.zeros(0, dtype=np.int64)
+    best, note, least = gps, "", _disagreeing(gps, least_m)
+    # A day has no more flights.
+    while least > few and len(starts) and len(steps) < 10:
+        explained = np.linalg.qr(np.c_[linear, order[:, None] >= steps])[0]
+        off = heights - explained @ (explained.T @ heights)
+        # A step, 1 from a start on, times a column is the sum of that column's end.
+        along, in_explained = (np.cumsum(part[::-1], axis=0)[::-1][starts] for part in (off, explained))
+        gains = along**2 / np.maximum(len(known) - starts - (in_explained**2).sum(1), 1e-9)
+        steps = np.append(steps, starts[gains.argmax()])
+        starts = starts[np.abs(starts - steps[-1]) >= 2 * few]
+        level = _levels(heights, linear, steps, least_m)
+        if level.any():
+            positions = gps.positions.copy()
+            positions[known, 2] -= level
+            moved = replace(gps, positions=positions)
+            if (now := _disagreeing(moved, least_m)) < least * 2 / 3:
+                shifts = ", ".join(f"{-shift:+.1f}" for shift in np.unique(level[level != 0]))
+                best, least, photos = moved, now, np.count_nonzero(level)
+                note = f"; GPS heights of {photos} photos are moved by {shifts} m, to the zero of the others"
+    return best, note
+
+
+def _levels(heights: Array, linear: Array, steps: NDArray[np.int64], least_m: float) -> Array:
+    """(N,) how much higher heights (N,) count than most, by those of some steps, rows at which they begin, that are
+    larger than `least_m` and rise at once, as no bent model does; `linear` (N, 4) explains the others."""
+    order, few = np.arange(len(heights)), PHOTOS_OF_ONE_ERROR
+    while len(steps):
+        fitted = np.linalg.lstsq(np.c_[linear, order[:, None] >= steps], heights)[0]
+        sizes, stepped = fitted[4:], heights - linear @ fitted[:4]
+        at_once = np.array([stepped[k : k + few].mean() - stepped[k - few : k].mean() for k in steps])
+        worth = np.minimum(np.abs(sizes) / least_m, 2 * at_once * sizes / np.maximum(sizes**2, 1e-12))
+        if worth.min() > 1:
+            levels, of_photo, counts = np.unique(
+                (order[:, None] >= steps) @ sizes, return_inverse=True, return_counts=True
+            )
+            return np.asarray((levels - levels[counts.argmax()])[of_photo])
+        steps = np.delete(steps, worth.argmin())
+    return np.zeros(len(heights))
+
+
+def _disagreeing(gps: GpsCameras, limit_m: float) -> float:
+    """How many of the positions with heights are far from their cameras; those within the limit count by its square."""
+    there = local_frame(gps.positions).apply(gps.positions)
+    known = np.isfinite(there[:, 2])
+    try:
+        fitted, _ = fit_sim3_robust(gps.centres[known], there[known], limit_m)
+    except ValueError:  # no three positions agree
+        return float(known.sum())
+    off = np.linalg.norm(fitted.apply(gps.centres[known]) - there[known], axis=1) / limit_m
+    return float(np.minimum(off**2, 1.0).sum())
 
 
 def place_by_control(

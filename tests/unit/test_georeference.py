@@ -251,6 +251,18 @@ def test_heights_of_two_flights_that_count_from_different_zeros_do_not_tilt_the_
     assert ["heights of 17 photos are moved by -1" in f.placement.reason for f in found] == [False, True]
 
 
+@pytest.mark.parametrize("zeros", [(0, 30, -25), (0, 40, 0), (0, 20, 40)])
+def test_heights_of_three_flights_each_with_a_zero_of_its_own_do_not_tilt_the_model(zeros):
+    truth = np.concatenate([flight() + [k * 90, k * 7, 0] for k in range(3)])
+    counted = truth + np.random.default_rng(0).normal(0, 1.5, truth.shape) + np.repeat(zeros, 30)[:, None] * UP
+    names, up = [f"{k:02d}.jpg" for k in range(90)], PLANTED.inverse().rotate(UP)
+    gps = GpsCameras(names, PLANTED.inverse().apply(truth), FRAME.inverse(counted), np.full((90, 2), 3.0))
+    placement = georeference(gps, None, up, GeoreferenceSettings(), 0).placement
+    assert np.degrees(np.arccos(placement.local_from_model.rotate(up) @ UP)) < 1
+    assert abs(placement.local_from_model.scale / PLANTED.scale - 1) < 0.01
+    assert "are moved by " in placement.reason and placement.inliers.all()
+
+
 def test_positions_that_hardly_move_give_no_scale():
     target = flight() * 0.02
     placement = place_by_gps(PLANTED.inverse().apply(target), target, np.array([0, 0, 1.0]), SETTINGS, seed=0)
