@@ -60,11 +60,11 @@ def object_facts(row: Row) -> dict[str, str]:
     if "surface_missing" in has:
         there, missing, *kinds = _surface(has)
         causes = ", ".join(f"{share} {what}" for what, share in zip(WORDS["missing"].values(), kinds) if share)
-        cells = f" (in cells of {length(has['surface_cell'], unit)})" if "surface_cell" in has else ""
         whole = "" if has.get("surface_of") in OF_ALL else f" of {has['surface_of']}"
-        plain = f", {percent(has['surface_plain'])} {WORDS['plain']}" if has.get("surface_plain") else ""
+        aside = [f"{percent(has['surface_plain'])} {WORDS['plain']}"] if has.get("surface_plain") else []
+        aside += [f"counted in cells of {length(has['surface_cell'], unit)}"] if "surface_cell" in has else []
         lost = f", {missing} is missing: {causes}" if missing else ""
-        facts["Surface"] = f"{there}{whole} is there{cells}{plain}{lost}"
+        facts["Surface"] = f"{there}{whole} is there" + (f" ({'; '.join(aside)})" if aside else "") + lost
         if has.get("ground_missing"):
             facts["Surface"] += f"; of the ground at its foot {percent(has['ground_missing'])} is missing"
     if found := accuracies(row):

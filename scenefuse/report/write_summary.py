@@ -213,12 +213,12 @@ def _measure(key: str) -> tuple[str, str]:
 
 
 def summary_text(run: RunSummary, tables: dict[str, pd.DataFrame], made: str) -> str:
-    """What a client asks of each scene and object, in a line or two each."""
+    """What a client asks of each scene and object, in three lines at most."""
     lines: list[str] = []
     for row in records(tables["scenes"]):
-        lines += ["", f"scene {row['scene']}", *_fact_lines(scene_facts(row), most=2)]
+        lines += ["", f"scene {row['scene']}", *_fact_lines(scene_facts(row), most=3)]
     for row in records(tables["objects"]):
-        lines += ["", f"object {row['object']}: {verdict(row)}", *_fact_lines(object_facts(row), most=2)]
+        lines += ["", f"object {row['object']}: {verdict(row)}", *_fact_lines(object_facts(row), most=3)]
     if run.failed:
         lines += ["", "jobs that failed", *(line for job in run.failed for line in _line("", job))]
     more = "details.txt says what the stages measured and chose; report.html shows it all."

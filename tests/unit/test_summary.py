@@ -516,6 +516,7 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
     metrics["object"] = size | {"world_deviation": quantity(0.0131, "m")}
     write_json(results / "objects/house/metrics.json", metrics)
     shares = {"missing": 0.018, "never_seen": 0.01, "untextured": 0.0, "contradicted": 0.008, "ground_missing": 0.012}
+    shares["plain"] = 0.123
     found = {name: quantity(share, "1") for name, share in shares.items()}
     found |= {"stations": quantity(3, ""), "stations_show": quantity(0.77, "1"), "cell": quantity(0.0521, "m")}
     write_json(results / "objects/house/missing.json", found)
@@ -529,8 +530,8 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
     card = re.sub("<.+?>", "", card).replace("\u00a0", " ")
     for sentence in (
         "11.4 m × 9.96 m, 8.10 m high, overall",
-        "98.2 % is there (in cells of 52.1 mm), 1.8 % is missing: 1.0 % seen by no photo (estimated),"
-        " 0.8 % where photos disagree; of the ground at its foot 1.2 % is missing",
+        "98.2 % is there (12 % as plain surface between measured parts; counted in cells of 52.1 mm), 1.8 % is missing:"
+        " 1.0 % seen by no photo (estimated), 0.8 % where photos disagree; of the ground at its foot 1.2 % is missing",
         "13.1 mm in the scene, the standard deviation of a point (two points in three are nearer)",
         "Photograph it from 3 places (results/objects/house/next_photos.csv): this would show 77 % of what no photo",
     ):
@@ -671,7 +672,7 @@ def test_a_long_advice_is_cut_in_summary_and_whole_in_details(results):
     summary = summarise(results)
     short, long = ((summary / f"{name}.txt").read_text().split("object balloon")[0] for name in ("summary", "details"))
     lines = short[short.index("Next  ") :].strip().splitlines()
-    assert len(lines) == 2 and lines[-1].endswith("... (details.txt)")
+    assert len(lines) == 3 and lines[-1].endswith("... (details.txt)")
     write_json(results / "objects/house/missing.json", {"stations": quantity(2, "")})
     first = "Next:   house: Photograph it from 2 places (results/objects/house/next_photos.csv) (1 more in the report)"
     assert closing_lines(summarise(results, ["house"])).splitlines()[-1] == first
@@ -747,7 +748,7 @@ def test_what_is_there_of_a_cloud_without_masks_is_not_said_of_the_whole_object(
 
 def test_how_much_of_what_is_there_photos_cannot_measure_is_said():
     row = {"object": "house", "status": "registered", "surface_missing": 0.02, "surface_never_seen": 0.02}
-    said = "98.0 % is there, 12 % as plain surface between measured parts, 2.0 % is missing"
+    said = "98.0 % is there (12 % as plain surface between measured parts), 2.0 % is missing"
     assert object_facts(row | {"surface_plain": 0.123})["Surface"].startswith(said)
 
 
