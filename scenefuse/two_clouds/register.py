@@ -13,10 +13,10 @@ import tyro
 
 from scenefuse.cloud.cloud_file import CloudFile, normals_fault, without_strays
 from scenefuse.cloud.clouds import Cloud, write_cloud
-from scenefuse.cloud.import_cloud import unit_and_name
+from scenefuse.cloud.import_cloud import MIN_POINTS, unit_and_name
 from scenefuse.cloud.readers.las import las_crs, las_dimensions
 from scenefuse.cloud.write_las import write_laz
-from scenefuse.core.settings import ROOT
+from scenefuse.core.settings import ROOT, problem, schema_of
 from scenefuse.core.stage import StageError, atomic_file, quantity, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.core.version import VERSION
@@ -107,6 +107,8 @@ def register(
     settings, shipped_seed = RegistrationSettings.read(config)
     command = _command(object, scene, out, format, bool(fuse), known, config, seed)
     seed = shipped_seed if seed is None else seed
+    if wrong := problem({"seed": seed}, schema_of("config")):
+        raise StageError(f"--{wrong}; correct it")
     known.check()
     scales = known.scales()
     _clear(out, [object, scene, *(path for path in (known.fiducials, config) if path)])
@@ -223,11 +225,11 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
         notes.append(f"what is written leaves out of {object} the dimensions {', '.join(unused)}")
     if whole.every > 1:
         notes.append(f"the part to look in is large: one in {whole.every} of its points is searched")
-    if box is not None and not len(whole.part):
+    if box is not None and len(whole.part) < MIN_POINTS:
         low, high = (" ".join(f"{x:.10g}" for x in end(whole.summary.sample, axis=0)) for end in (np.min, np.max))
         raise StageError(
-            "no scene point lies in the crop box; give least x y z, then greatest x y z, of what lies from about"
-            f" {low} to {high} in {scene}"
+            f"{len(whole.part)} scene points lie in the crop box, {MIN_POINTS} are needed; give least x y z, then"
+            f" greatest x y z, of what lies from about {low} to {high} in {scene}"
         )
     # Marks around which nothing lies are far from all of the scene, which the crop says.
     near = whole.part if len(whole.part) else Cloud(whole.summary.sample)

@@ -182,7 +182,15 @@ def test_a_column_with_a_space_in_its_name_is_written(tmp_path, house, monkeypat
         ({"scale": 1.0, "scale_range": (1.0, 2.0)}, "give one"),
         ({"up_object": (0.0, 0.0, 1.0)}, "--up-scene"),
         ({"up_scene": (0.0, 0.0, 0.0)}, "needs a direction"),
-        ({"crop_box": (90.0, 90.0, 90.0, 91.0, 91.0, 91.0)}, "crop box; .* lies from about .* to .* in scene.ply"),
+        (
+            {"crop_box": (90.0, 90.0, 90.0, 91.0, 91.0, 91.0)},
+            "^0 scene points lie .*, of what lies from about .* to .* in",
+        ),
+        (
+            {"crop_box": (-1.0, -1.0, 0.0, 1.0, 1.0, 3.0)},
+            r"^1?\d?\d scene points lie in the crop box, 200 are",
+        ),
+        ({"seed": -1}, "--seed: -1 is less than the minimum of 0; correct it"),
         ({"fiducials": Path("three.txt")}, "at least 4"),
         ({"fiducials": Path("same.txt")}, "gives 1 fiducials; .* at least 4 different points"),
         ({"fiducials": Path("far.txt")}, "nearest scene point"),
@@ -215,7 +223,7 @@ def test_bad_input_is_one_sentence(tmp_path, monkeypatch, house, options, words)
     Path("clicks.tsv").write_text("point\tphoto\tx_px\ty_px\na\tb.jpg\t1\t1\n")
     Path("typo.yaml").write_text("registration: {fine: {max_scale_sd: 0.1}}")
     files = {"object": Path("scene.ply"), "scene": Path("scene.ply")}
-    others = {name: option for name, option in options.items() if name in ("object", "scene", "config", "out")}
+    others = {name: option for name, option in options.items() if name in ("object", "scene", "config", "out", "seed")}
     known = Known(**{name: option for name, option in options.items() if name not in others})
     with pytest.raises(StageError, match=words):
         register(**(files | others), known=known)
