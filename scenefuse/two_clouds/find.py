@@ -17,13 +17,23 @@ from scenefuse.core.transforms import UP, Array, Sim3, uncertainty_quantities
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import MIN_POINTS, around_marks, crop_marked
 from scenefuse.geometry.icp import ScaleRange
+from scenefuse.geometry.surface import SCORE_FRACTION
 from scenefuse.marks.clicks import ScenePoints, read_points
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg
-from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, comparable, estimates, prior
+from scenefuse.register.problem import (
+    SURFACE_POINTS,
+    Constraints,
+    Problem,
+    ScaleSettings,
+    check_extent,
+    comparable,
+    estimates,
+    prior,
+)
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.register_object import pose_quantities, rests_on
-from scenefuse.register.score import DISTINCT_SHIFT, AgreementSettings, Hypothesis, lead, registration_metrics
+from scenefuse.register.score import DISTINCT_SHIFT, AgreementSettings, Hypothesis, lead, registration_metrics, score
 from scenefuse.two_clouds.places import MAX_PLACES, likely_places
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
@@ -263,7 +273,8 @@ def find_in_scene(
         tried.append((refined(there, settings, unit), part))
     found, part = max(tried, key=lambda one: (one[0].registered, one[0].total))
     if len(tried) > 1:
-        found = _unless_elsewhere(found, [other for other, _ in tried], obj, settings.fine)
+        others = [(there, one) for (there, _), (one, _) in zip(kept, tried)]
+        found = _unless_elsewhere(found, others, obj, settings.fine)
     if not found.registered and not estimate_sides and (_is_inward(obj) or _is_inward(part)):
         progress("most normals face inwards: again, with their sides estimated")
         other, where, places = find_in_scene(
@@ -283,10 +294,21 @@ def _is_inward(cloud: Cloud) -> bool:
     return normals is not None and bool(((off * normals).sum(1) < 0).mean() > 0.5)
 
 
+def total_at_scale(there: Search, found: Registration, scale: float) -> float:
+    """The score of the best pose in a part of a scene, by distances and areas of the object at a scale: the part's own
+    are of the box around it, which is the larger the more it is turned."""
+    if found.outcome is None:
+        return 0.0
+    problem, pose, across = there.problem, found.outcome.ranked[0].pose, scale * there.problem.object.diagonal
+    fraction = SCORE_FRACTION / 2 * across / problem.scene.diagonal
+    surfaces = problem.surfaces(pose.scale, fraction, SURFACE_POINTS)
+    return score(*surfaces, pose, SCORE_FRACTION * across, scale).total
+
+
 def _unless_elsewhere(
-    found: Registration, others: list[Registration], obj: Cloud, settings: FineSettings
+    found: Registration, tried: list[tuple[Search, Registration]], obj: Cloud, settings: FineSettings
 ) -> Registration:
-    """A registration, or a refusal where the object fits another place nearly as well."""
+    """A registration, or a refusal where the object fits another of the places tried nearly as well."""
     pose, outcome = found.scene_from_object, found.outcome
     if pose is None or outcome is None:
         return found
@@ -297,20 +319,20 @@ def _unless_elsewhere(
         return replace(found, outcome=replace(outcome, decision=replace(decision, reason=reason)))
     middle, size = obj.points.mean(0), pose.scale * obj.diagonal
     elsewhere = [
-        (other.total, there)
-        for other in others
+        (total_at_scale(there, other, pose.scale), at)
+        for there, other in tried
         if other.scene_from_object is not None
-        and np.linalg.norm((there := other.scene_from_object.apply(middle)) - pose.apply(middle))
-        > DISTINCT_SHIFT * size
+        and np.linalg.norm((at := other.scene_from_object.apply(middle)) - pose.apply(middle)) > DISTINCT_SHIFT * size
     ]
     if not elsewhere:
         return found
-    total, there = max(elsewhere, key=lambda one: one[0])
-    decision = replace(decision, margin=min(decision.margin, lead(found.total, total)))
+    total, place = max(elsewhere, key=lambda one: one[0])
+    own = next(total_at_scale(there, one, pose.scale) for there, one in tried if one is found)
+    decision = replace(decision, margin=min(decision.margin, lead(own, total)))
     if decision.margin < settings.min_margin:
-        at = " ".join(f"{x:.10g}" for x in there)
+        where = " ".join(f"{x:.10g}" for x in place)
         short = f"the margin is {decision.margin:.3f}, below {settings.min_margin:.3f}"
-        decision = replace(decision, registered=False, reason=f"another place is nearly as good, at ({at}): {short}")
+        decision = replace(decision, registered=False, reason=f"another place is nearly as good, at ({where}): {short}")
     return replace(found, outcome=replace(outcome, decision=decision))
 
 

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.planted import plant_wide
+from scipy.spatial.transform import Rotation
+from support.planted import plant, plant_wide
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import UP, Sim3
@@ -12,10 +13,11 @@ from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import Decision, FineSettings
+from scenefuse.register.problem import Problem
 from scenefuse.register.refinement import Outcome
 from scenefuse.register.score import Hypothesis, Score
 from scenefuse.two_clouds import find as register
-from scenefuse.two_clouds.find import Registration, RegistrationSettings, find_in_scene
+from scenefuse.two_clouds.find import Registration, RegistrationSettings, Search, find_in_scene, total_at_scale
 from scenefuse.two_clouds.places import likely_places
 
 LITTLE = RegistrationSettings(
@@ -70,6 +72,7 @@ def chosen(monkeypatch, yard, *there):
     monkeypatch.setattr(register, "search", lambda *known: next(there))
     monkeypatch.setattr(register, "refined", lambda found, *known: found)
     monkeypatch.setattr(register, "with_agreement", lambda found, *known: found)
+    monkeypatch.setattr(register, "total_at_scale", lambda there, found, scale: found.total)
     monkeypatch.setattr(register, "likely_places", lambda *known: [np.arange(300), np.arange(300, 600)])
     return find_in_scene(yard.object, yard.scene, LITTLE, 0)
 
@@ -105,6 +108,20 @@ def test_an_object_that_fits_two_places_is_refused(monkeypatch, yard):
     # The same place twice, by the whole scene and by a part of it, is one.
     near = [0.03 * yard.object.diagonal, 0, 0]
     assert chosen(monkeypatch, yard, tried(0.1, far, False), tried(0.8, [0, 0, 0]), tried(0.79, near))[0].registered
+
+
+def test_places_are_compared_by_the_object_s_size_not_by_boxes_that_grow_where_they_are_turned():
+    trial, totals, boxes = plant("house", 3, ground=False, object_points=6000), [], []
+    for turn in (0.0, 0.7):
+        placed = Sim3(1.0, Rotation.from_euler("z", turn).as_matrix(), np.zeros(3))
+        pose, scene = placed @ trial.scene_from_object, trial.scene.transformed(placed)
+        problem = Problem(trial.object, scene, ScaleRange(pose.scale, 0.0))
+        there = Search(problem, (np.zeros(3), np.zeros(3)), [])
+        one = Hypothesis(pose, "planted", Score(1.0, 1.0, 1.0, None, None, 1.0))
+        found = Registration(Outcome([one], None, None), there.origins, problem.scales, {})
+        totals.append(total_at_scale(there, found, pose.scale))
+        boxes.append(scene.diagonal)
+    assert boxes[1] > 1.1 * boxes[0] and abs(totals[1] - totals[0]) < 0.01 and totals[0] > 0.6
 
 
 def test_where_normals_face_inwards_on_one_side_it_is_searched_again_without_those_of_either(monkeypatch, yard):
