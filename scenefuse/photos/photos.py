@@ -38,7 +38,7 @@ class Photo:
         longitude_deg: WGS84 longitude, likewise.
         altitude_m: altitude, likewise.
         focal_px: focal length that EXIF's 35 mm equivalent gives, or None.
-        camera: maker and model from EXIF, or "".
+        camera: maker and model from EXIF, and the digital zoom where there is one, or "".
         orientation: EXIF orientation; 1 is upright.
         horizontal_sd_m: standard deviation of the position, east and north, from XMP or geo.txt, or None.
         vertical_sd_m: of the altitude, likewise.
@@ -185,6 +185,8 @@ def inspect_photo(folder: Path, name: str) -> Photo:
         if image.mode in ("F", "I"):
             raise ValueError("its pixels are 32-bit measurements, as a thermal camera's, and no picture")
         bits = unused_bits(pixels_of(image, folder / name))
+        # It crops what the lens shows, and focal lengths in EXIF often do not count it; 0 is for none.
+        zoom = f"{exif_number(taken.get(Base.DigitalZoomRatio)) or 1:.2f}"
         width, height = image.size
         return Photo(
             name,
@@ -193,7 +195,8 @@ def inspect_photo(folder: Path, name: str) -> Photo:
             sha256(folder / name),
             # A 35 mm frame is 36 mm wide; COLMAP takes its prior from the longer side in the same way.
             focal_px=equivalent_mm / 36.0 * max(width, height) or None,
-            camera=f"{exif_text(exif.get(Base.Make))} {exif_text(exif.get(Base.Model))}".strip(),
+            camera=f"{exif_text(exif.get(Base.Make))} {exif_text(exif.get(Base.Model))}".strip()
+            + (f" zoomed {zoom} times" if zoom != "1.00" else ""),
             orientation=int(orientation) if orientation in range(1, 9) else 1,
             focal_mm=focal_mm or None,
             position_note=note,

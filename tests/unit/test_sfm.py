@@ -17,7 +17,7 @@ from scenefuse.georef.georeference import camera_poses
 from scenefuse.mvs.undistort import UndistortSettings, undistort_photos, undistort_picture
 from scenefuse.photos.frames import FrameSettings, VideoSettings, extract_frames, list_photos
 from scenefuse.photos.geodesy import LocalFrame
-from scenefuse.photos.photos import Photo, read_photos, write_photos
+from scenefuse.photos.photos import Photo, inspect_photo, read_photos, write_photos
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm import mapping
 from scenefuse.sfm.colmap import cancellable, doubtful_photos, explained_matches, require_database
@@ -186,6 +186,16 @@ def test_a_zoom_lens_that_does_not_tell_its_35_mm_equivalent_is_a_camera_for_eac
     # The equivalent says the same, and more; a lens that tells a little more at another distance stays one camera.
     prime = [replace(photo(f"{mm}", focal=900.0), focal_mm=mm) for mm in (35.0, 36.4)]
     assert len(camera_groups(prime, "auto")) == 1
+
+
+def test_photos_of_another_digital_zoom_have_a_camera_of_their_own(tmp_path):
+    (tmp_path / "p").mkdir()
+    for number, zoom in enumerate((None, 0.0, 1.0, 1.3, 2.0, 1.3)):
+        exif = Image.Exif()
+        exif[0x0110], exif[0x8769] = "E-M1", {0x920A: 12.0} | ({} if zoom is None else {0xA404: zoom})
+        Image.new("RGB", (40, 40), (number, 0, 0)).save(tmp_path / "p" / f"{number}.jpg", exif=exif)
+    photos = [inspect_photo(tmp_path / "p", f"{number}.jpg") for number in range(6)]
+    assert camera_groups(photos, "auto") == [["0.jpg", "1.jpg", "2.jpg"], ["3.jpg", "5.jpg"], ["4.jpg"]]
 
 
 def test_an_error_in_a_worker_reaches_the_caller():
