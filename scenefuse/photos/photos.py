@@ -179,8 +179,9 @@ def inspect_photo(folder: Path, name: str) -> Photo:
         )
         if b"BandName" in xmp and len(image.getbands()) == 1:
             raise ValueError("it is one band of a multispectral camera, and no photo in colours")
-        # The widest cameras take pictures of 65 to 24.
-        if b"GPano:ProjectionType" in xmp or max(image.size) > 3 * min(image.size):
+        # The widest cameras take pictures of 65 to 24; 6 is what iPhones write into panoramas.
+        panorama = b"GPano:ProjectionType" in xmp or taken.get(Base.CustomRendered) == 6
+        if panorama or max(image.size) > 3 * min(image.size):
             raise ValueError("it is a panorama, to which no lens is fitted: cut it into views")
         if image.mode in ("F", "I"):
             raise ValueError("its pixels are 32-bit measurements, as a thermal camera's, and no picture")

@@ -286,6 +286,14 @@ def test_panoramas_and_bands_are_named(tmp_path, mode, size, xmp, sentence):
         assert listed(tmp_path, tmp_path / "p")[0].width == size[0]
 
 
+def test_a_panorama_of_an_iphone_is_named(tmp_path):
+    exif = Image.Exif()
+    exif[0x8769] = {0xA401: 6}
+    Image.new("RGB", (100, 40)).save(tmp_path / "a.jpg", exif=exif)
+    with pytest.raises(StageError, match="it is a panorama"):
+        inspect_photo(tmp_path, "a.jpg")
+
+
 def test_photos_in_symlinked_folders_are_found_once(tmp_path):
     save(tmp_path / "disk" / "card" / "a.jpg")
     (tmp_path / "p").mkdir()
