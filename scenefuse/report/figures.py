@@ -200,9 +200,11 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     shown_from, middle = join.stations[: len(SIDES_DEG) - 1], (join.framed.min(0) + join.framed.max(0)) / 2
     for number, place in enumerate(shown_from, 1):
         x, y = (place - middle)[:2]
-        label = f"from station {number}, {np.hypot(x, y):.3g} {join.unit}"
+        # To two digits: nobody stands more exactly.
+        away, up = (f"{float(f'{far:.2g}'):g}" for far in (np.hypot(x, y), place[2] - join.framed[:, 2].min()))
+        label = f"from station {number}, {away} {join.unit}"
         label += f" {compass(np.degrees(np.arctan2(x, y)))} of it" if join.has_north else " away"
-        label += f", {place[2] - join.framed[:, 2].min():.3g} {join.unit} up"
+        label += f", {up} {join.unit} up"
         cameras[label] = camera_at(place, join.framed, TILE_PX)
     for azimuth in SIDES_DEG[len(cameras) :]:
         cameras[_from(azimuth, join.has_north)] = orbit_camera(join.framed, azimuth, 20.0, TILE_PX)

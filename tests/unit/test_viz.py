@@ -349,8 +349,8 @@ def test_stations_are_named_by_where_they_stand_if_north_is_known(capture, tmp_p
     draw(capture, REGISTERED, tmp_path / "placed")
     table.write_text(plain)
     assert [label for label in labels if "station 1" in label] == [
-        "from station 1, 3.16 m away, 3 m up",
-        "from station 1, 3.16 m east of it, 3 m up",
+        "from station 1, 3.2 m away, 3 m up",
+        "from station 1, 3.2 m east of it, 3 m up",
     ]
 
 
