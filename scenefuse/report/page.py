@@ -83,7 +83,7 @@ def view_section(key: str, name: str, view: View, mesh: ViewMesh | None = None, 
     buttons = {mode["name"]: mode["button"] for mode in modes}
     whens, triangles, picture = {"before": "Before", "after": "After"}, b"", ""
     if mesh is not None:
-        whens["surface"] = "Surface"
+        whens["surface"] = "Mesh"
         middle = (view.cloud.points.min(0) + view.cloud.points.max(0)) / 2
         about["surface"], triangles = encode_mesh(mesh, middle, deviations)
         own = _mesh_modes(mesh, [mode for mode in modes if mode["name"] == "deviation"])

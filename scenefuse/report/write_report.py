@@ -169,7 +169,7 @@ def _object_record(folder: Path, texts: Texts) -> str:
     """The figures of an object that say how its result came about."""
     figures = {folder / name: caption for name, caption in texts["object_figures"].items()}
     shown = "".join(figure(path, caption) for path, caption in figures.items() if path.is_file())
-    return _folded(f"Figures of {folder.name}", shown) if shown else ""
+    return _folded(f"Pictures of {folder.name}", shown) if shown else ""
 
 
 def _table_section(table: pd.DataFrame, title: str, note: str, turned: bool = False) -> str:

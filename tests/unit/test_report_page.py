@@ -206,7 +206,7 @@ def test_the_surface_is_shown_with_photos_class_and_deviation_beside_the_points(
     assert "photos on the mesh" in browser.find(f"{SECTION} .view-legend").text  # it is shown first
     choose(browser, "After")
     choose(browser, "Source")
-    choose(browser, "Surface")
+    choose(browser, "Mesh")
     browser.value("await new Promise((next) => setTimeout(next, 400));")
     # What a mesh does not have is not offered, and another colour is chosen.
     assert "Source" not in browser.find(f"{SECTION} .colour").text
@@ -226,6 +226,7 @@ def test_the_surface_is_shown_with_photos_class_and_deviation_beside_the_points(
     width, height = stage.size["width"], stage.size["height"]
     for right, down in ((0.4, 0.45), (0.55, 0.45), (0.5, 0.6)):
         click(browser, stage, right * width, down * height)
+    assert browser.find(f"{SECTION} output").text == "Below is the command that draws it, in the project's folder."
     words = browser.find(f"{SECTION} .command").text.split()
     assert words[:6] == ["scenefuse", "export", "--what", "drawings", "--object", "house"]
     clicked = np.array(words[7:], np.float64).reshape(3, 3)

@@ -329,7 +329,7 @@ class View {
     const places = this.picked.map((point) => middle.map((along, axis) => along + point[axis]));
     const numbers = places.flat().map((x) => Number(x.toFixed(6))).join(" ");
     this.command.textContent = `scenefuse export --what drawings --object ${name} --facade ${numbers}`;
-    this.output.textContent = "Below is the command that draws it.";
+    this.output.textContent = "Below is the command that draws it, in the project's folder.";
   }
 
   distance() {
