@@ -81,7 +81,7 @@ def _need_project(*elsewhere: str) -> None:
 
     if not (SCENES.is_file() or Path.cwd() == ROOT or any(word.startswith(elsewhere) for word in sys.argv[1:])):
         where = f"there is no {SCENES} here ({Path.cwd()})"
-        sys.exit(f"error: {where}; run this in a project that scenefuse init FOLDER made, or give --configfile")
+        sys.exit(f"error: {where}; run this in a project of scenefuse complete or scenefuse init, or give --configfile")
 
 
 def _settings_files() -> tuple[list[Path], list[str]]:

@@ -160,8 +160,8 @@ def _click(project: Path, name: str, shows: bool) -> None:
         StageError: nobody can, or nobody did.
     """
     by_file = (
-        f"give its clicks by --prompts FILE or its masks by --masks FOLDER (docs/clicking.md), or run scenefuse pick in"
-        f" {project} and open the address that it prints from a computer with a screen"
+        f"give its clicks by --prompts FILE or its masks by --masks FOLDER ({project / 'README.md'} says how), or run"
+        f" scenefuse pick in {project} and open the address that it prints from a computer with a screen"
     )
     if not shows and not sys.stdin.isatty():
         raise StageError(f"{name} has no clicks yet, and there is no screen to click on; {by_file}")

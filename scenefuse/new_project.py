@@ -80,7 +80,8 @@ def make_project(folder: Path, scene: Path | None, objects: Sequence[Path], pres
         if path.is_dir():
             names = [file.relative_to(path).as_posix() for file in photo_files(path)]
             # README.md says how to photograph.
-            few = ", which is few: every part has to be in three or more; an object takes 30 to 100, from all sides"
+            few = ", which is few: every part has to be in three or more"
+            few += "" if path is scene else "; an object takes 30 to 100, from all sides"
             said += f", {in_folders(names)}{few if len(names) < 30 else ''}"
         print(f"{path}: {said}", flush=True)
     return rows
@@ -91,7 +92,7 @@ def project_rows(folder: Path, scene: Path | None, objects: Sequence[Path]) -> d
     names = [default_name(path) for path in objects]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise StageError(f"two objects would be called '{twice}'; rename one of their folders or files")
+        raise StageError(f"two objects would be called '{twice}'; give each once, or rename a folder or file")
     if scene is not None and scene.resolve() in (path.resolve() for path in objects):
         raise StageError(f"{scene} is given as the scene and as an object; give the object's own photos")
     folders = [path.resolve() for path in (scene, *objects) if path is not None and path.is_dir()]
@@ -140,7 +141,7 @@ def _source(path: Path, folder: Path, least: int = FIXING_POINTS) -> dict[str, s
             raise StageError(f"the project {folder} would lie among its photos in {path}; give a folder of its own")
         clouds = sorted(file.name for file in path.iterdir() if is_cloud(file))
         if clouds and not any(file.suffix.lower() in SUFFIXES for file in path.rglob("*")):
-            raise StageError(f"{path} holds clouds ({clouds[0]}, ...); give one cloud, its tiles merged into a file")
+            raise StageError(f"{path} holds no photos; if its files ({clouds[0]}, ...) are clouds, merge and give one")
         if (count := len(photo_files(path))) < least:
             raise StageError(f"{path} holds {count} {'photo' if count == 1 else 'photos'}; {least} or more are needed")
     elif not (is_cloud(path) or suffix in VIDEO_SUFFIXES):

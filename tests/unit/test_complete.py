@@ -142,7 +142,7 @@ def test_a_second_run_in_the_same_project_is_refused_and_leaves_the_first_ones_l
 def test_without_a_screen_an_object_without_clicks_is_one_sentence(two_folders, monkeypatch):
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False)
     with pytest.raises(
-        StageError, match="close has no clicks yet, and there is no screen to click on; give its clicks"
+        StageError, match="close has no clicks yet, and there is no screen to click on; give .*README.md says"
     ):
         run("close")
     # The header alone, which the page leaves when a click is undone, is none.
@@ -213,10 +213,12 @@ def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
     Path("page.ply").write_text("<html>")
     Project(two_folders).photos("one", 1)
     Project(two_folders).photos("flight/shed", 4)
+    with pytest.raises(StageError, match="two objects would be called 'close'; give each once"):
+        run("close", "close")
     for folder, sentence in (
         ("empty", "the photo folder empty holds no photos"),
         ("filmed", r"filmed holds no photos; .*\(or give a video itself: filmed/clip.MP4\)"),
-        ("tiles", r"tiles holds clouds \(1.laz, ...\); give one cloud, its tiles merged into a file"),
+        ("tiles", r"tiles holds no photos; if its files \(1.laz, ...\) are clouds, merge and give one"),
         ("notes.txt", r"notes.txt is not a readable TXT cloud \(none of its first lines holds three numbers"),
         ("none.ply", "none.ply holds no points; look at what wrote it"),
         ("page.ply", "page.ply is not a readable PLY cloud"),
@@ -326,6 +328,10 @@ def test_init_ends_with_the_next_command_by_its_real_names_and_says_how_many_pho
     said = capsys.readouterr().out
     assert "next: cd yard && scenefuse pick --object close " in said
     assert "many: the scene, 30 photos\n" in said and "close: an object, 5 photos, which is few: every part" in said
+    init(Path("few"), scene=Path("close"), objects=())
+    assert capsys.readouterr().out.startswith(
+        "close: the scene, 5 photos, which is few: every part has to be in three or more\n"
+    )
     init(Path("bare"))
     assert "next: cd bare, and fill in both tables in config/ " in capsys.readouterr().out
     with pytest.raises(StageError, match="close holds photos, and the project would lie among them; give a folder of"):
