@@ -326,6 +326,7 @@ def test_wrong_cameras_are_named(tmp_path):
         ("model.nvm", "NVM_V3\n", "VisualSFM's NVM; export the reconstruction as Bundler's"),
         ("a_calibrated_camera_parameters.txt", "fileName imageWidth", "Pix4D's; export OPF"),
         ("sfm.json", '{"version": ["1"], "featuresFolders": []}', "Meshroom's; convert it to COLMAP"),
+        ("synth_0.out", "drews 1.0\n1 0\n0.9 0 0\n", "MVE's; give the cameras of COLMAP"),
         ("sfm_data.json", '{"sfm_data_version": "0.3"}', "OpenMVG's; convert it to COLMAP"),
         ("cameras.json", '[{"id": 0, "img_name": "a"}]', "a list of Gaussian splatting; give the model of COLMAP"),
         ("images.txt", "# Image list", "part of COLMAP's project; give the folder"),

@@ -58,6 +58,7 @@ UNREAD = {
     r"\.(p4d|opf)$|calibrated_(external_)?camera": ("Pix4D's", "export OPF, and convert it by opf2nerf of pyopf"),
     r"\.(sfm|mg|abc)$|\"featuresFolders\"": ("Meshroom's", "convert it to COLMAP by aliceVision_exportColmap"),
     r"\"sfm_data_version\"": ("OpenMVG's", "convert it to COLMAP by openMVG_main_openMVG2Colmap"),
+    r"^drews \d": ("MVE's", "give the cameras of COLMAP, or of another program, for the same photos"),
     r"\"img_name\"": ("a list of Gaussian splatting", "give the model of COLMAP that it was trained on"),
     r"poses_bounds\.npy$": ("LLFF's", "give the model of COLMAP that it was made from"),
     r"^(cameras|images|points3D)\.(txt|bin)$|^SQLite": ("a part of COLMAP's project", "give the folder of the model"),
