@@ -10,7 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import atomic_file, quantity
-from scenefuse.core.transforms import MAX_DEVIATIONS, Array
+from scenefuse.core.transforms import MAX_DEVIATIONS, SD_OVER_MEDIAN, Array
 from scenefuse.georef.control import Control, LocatedPoint, seen_at
 from scenefuse.georef.placement import GpsCameras, Placement
 from scenefuse.marks.triangulation import Lengths
@@ -153,7 +153,7 @@ def _of_lengths(lengths: Lengths, used: bool) -> dict[str, Any]:
 
 def _of_points(found: Georeference, control: Control, left: Residuals) -> dict[str, Any]:
     """Errors at control and at check points, as quantities."""
-    notes = [*control.notes, *_misfits(found, control, left)]
+    notes = [*control.notes, *_misfits(found, control, left), *_near_a_line(found, control, left)]
     for note in notes:
         print(f"note: {note}", flush=True)
     check = np.array([s.point.check and not s.problem for s in control.located])
@@ -184,6 +184,24 @@ def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str
     return [
         f"{len(worst)} of {used.sum()} control points are more than {MAX_DEVIATIONS:g} stated standard deviations off,"
         f" in metres: {', '.join(named)}; correct coordinates and clicks, or state larger deviations in columns 8 and 9"
+    ]
+
+
+def _near_a_line(found: Georeference, control: Control, left: Residuals) -> list[str]:
+    """A note where control points without GPS lie so near to one line that heights as far beside it as they reach along
+    it (RMS) are known much worse than is stated of theirs."""
+    rows = found.placement.used & np.isfinite(left.points).all(1)
+    if found.frame is None or found.placement.inliers.any():
+        return []
+    at = found.frame.apply(np.array([s.point.position for s in control.located])[rows])
+    along, across, _ = np.linalg.svd(at - at.mean(0), compute_uv=False) / [np.sqrt(len(at)), 1.0, 1.0]
+    stated_m = float(np.median([s.point.sd_m[1] for s, row in zip(control.located, rows) if row]))
+    open_m = along / across * max(stated_m, SD_OVER_MEDIAN * float(np.median(np.abs(left.points[rows, 2]))))
+    if open_m <= MAX_DEVIATIONS * stated_m:
+        return []
+    return [
+        f"the control points lie near one line: {along:.3g} m beside it heights are known to {open_m:.2g} m only; add a"
+        " point there"
     ]
 
 

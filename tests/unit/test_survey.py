@@ -351,6 +351,15 @@ def test_control_points_along_one_line_are_refused(tmp_path, model):
         georeferenced(tmp_path, model, without_gps(), gcp_lines(FLIGHT, along, list("abcde")))
 
 
+def test_control_points_near_one_line_are_said_to_leave_heights_beside_it_open(tmp_path, model):
+    near = np.array([[t, k % 2 - 0.5, 0.1 * k] for k, t in enumerate((-30, -15, 0, 15, 30))])
+    lines = gcp_lines(FLIGHT, np.vstack([near, [[0, 20, 1]]]), [*"abcde", "CHK-1"], noise_px=0.5)
+    report, _, rows = georeferenced(tmp_path, model, without_gps(), lines)
+    (note,) = value(report, "control_notes")
+    assert "near one line: 21.2 m beside it heights are known to " in note
+    assert abs(float(rows["CHK-1"]["up_m"])) > 1 > 10 * abs(float(rows["a"]["up_m"]))
+
+
 def test_control_points_of_which_those_that_agree_lie_along_one_line_are_refused(tmp_path, model):
     places = np.array([[-30, -15, 0.1], [0, 0, 0.1], [30, 15, 0.1], [-20, 20, 1.0]])
     lines = changed(gcp_lines(FLIGHT, places, list("abcd"), noise_px=0.3), "d", 1, lambda y: y + 25)
