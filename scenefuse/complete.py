@@ -60,7 +60,8 @@ def complete(
         house: close-up photos of an object in it, likewise.
         others: the same of more objects.
         out: folder of the project; where it is left out, FLIGHT_completed.
-        prompts: tables of clicks, one for each object with photos in its order, in place of the page.
+        prompts: tables of clicks (label, photo, x_px, y_px, tab-separated), one for each object with photos in its
+            order, in place of the page.
         masks: folders of masks, likewise, named like its photos; white is the object.
         preset: of a new project: settings for a first look, the shipped ones (normal, where it is left out), or larger
             ones for a GPU.

@@ -64,7 +64,7 @@ def draw_scene(
     crops = {f.name: read_cloud(f / "registration/full/crop.ply").points for f in shown}
     boxes = {name: box_corners(crop.min(0), crop.max(0)) for name, crop in crops.items()}
     drawn = "" if every == 1 else f" (one in {every} is drawn)"
-    note = f"{len(scene):,} points{drawn}, objects (boxes): {len(boxes)}, "
+    note = f"{len(scene):,} points before completion{drawn}, objects (boxes): {len(boxes)}, "
     note += f"cameras (red): {len(views)}" if georeferenced else "given as a cloud"
     errors = pd.DataFrame() if residuals is None else read_table(residuals)
     frame = None if georeference_json is None else scene_frame(read_json(georeference_json))

@@ -36,7 +36,7 @@ def write_pdf(
     rows = rows_of(summary, "object", objects)
     facts = [object_facts(row) | surface_facts(folder, row) for folder, row in zip(objects, rows)]
     page = _Page(title or title_of(objects), made_by(summary))
-    page.start(page.project, f"{page.made} The files that are named here lie in the project's folder.")
+    page.start(page.project, f"{page.made} Files named here lie in the project's folder or the archive you were sent.")
     for row in rows_of(summary, "scene", scenes):
         page.text_line(f"Scene {row['scene']}", 12)
         page.facts(scene_facts(row))

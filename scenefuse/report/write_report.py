@@ -136,7 +136,8 @@ def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str
     elif status in texts["no_view"]:
         parts.append(f"<p>{texts['no_view'][status]}</p>")
     if is_finished and (figures / "missing.png").is_file():
-        parts.append(_folded("What is missing", figure(figures / "missing.png", texts["missing"])))
+        where = figure(figures / "missing.png", texts["missing"])
+        parts.append(_folded("What is missing, and where to photograph it from", where))
     if (masks := folder / "masks.png").is_file():
         parts.append(_folded("What was taken for the object in its photos", figure(masks, texts["masks"])))
     return "\n".join([*parts, "</section>"])
