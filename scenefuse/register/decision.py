@@ -124,6 +124,11 @@ def decide(
     """
     best, rest = ranked[0], ranked[1:]
     rivals, free_axis = _rivals(best, rest, obj, problem.scene.diagonal, settings, repetition.same_shift)
+    if uncertainty is not None and uncertainty.rotation_sd_deg > settings.max_rotation_sd_deg:
+        # A column that can be turned over as well: which of its poses are found is chance, what leaves it open is not.
+        turn = _turned_about(best.pose, uncertainty.rotation_axis, obj.points.mean(0))
+        if _turns_onto_itself(obj, turn, settings.score_fraction * problem.scene.diagonal / best.pose.scale):
+            free_axis = uncertainty.rotation_axis
     rival = rivals[0] if rivals else None
     # The alignment's pose may score less than a rival: then there is no lead.
     margin = 1.0 if rival is None else lead(best.score.total, rival.score.total)
@@ -264,6 +269,13 @@ def _reasons_of_spread(
     shift, most = uncertainty.translation_sd / diagonal, settings.max_translation_sd_fraction
     if shift > most:
         yield f"the position is uncertain by {shift:.1%} of the diagonal, more than {most:.1%}"
+
+
+def _turned_about(pose: Sim3, axis: Array, centre: Array) -> Sim3:
+    """The turn of the object's frame about its centre (3,) and an axis (3,) in the scene, as far as turned poses are
+    apart."""
+    rotation = Rotation.from_rotvec(np.radians(3 * DISTINCT_ANGLE_DEG) * (pose.rotation.T @ axis)).as_matrix()
+    return Sim3(1.0, rotation, centre - rotation @ centre)
 
 
 def rotation_axis(rotation: Array) -> Array:

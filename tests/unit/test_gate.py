@@ -58,6 +58,14 @@ def tower(depth, colors=None, fin=False):
     return Surface(points, normals, painted, cKDTree(points), np.arange(len(points)))
 
 
+def column():
+    """A column of radius 2 and 8 high about the origin, on a grid of points."""
+    angle, height = (side.ravel() for side in np.meshgrid(np.radians(np.arange(0, 360, 5)), np.linspace(-4, 4, 41)))
+    normals = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    points = 2 * normals + height[:, None] * Z
+    return Surface(points, normals, None, cKDTree(points), np.arange(len(points)))
+
+
 def left_red(point):
     return (0.9, 0.1, 0.1) if point[0] < 0 else (0.1, 0.1, 0.9)
 
@@ -217,6 +225,8 @@ CASES = [
     Case("the first free axis is reported", None, obj=SQUARE, rivals=((QUARTER, 1.0), (turn(X, 180), 1.0)),
          also={"free_axis": Z}),
     Case("uncertain about the free axis", None, obj=SQUARE, rivals=((QUARTER, 1.0),), sure=(0.002, 20, 0.001), axis=-Z),
+    Case("a column that was found upside down", None, obj=column(), rivals=((turn(X, 180), 1.0),),
+         sure=(0.002, 20, 0.001), axis=Z, also={"free_axis": Z, "rival": None}),
     Case("uncertain about another axis", "the rotation is uncertain", obj=SQUARE, rivals=((QUARTER, 1.0),),
          sure=(0.002, 20, 0.001), axis=turn(X, 30).rotate(Z)),
 ]  # fmt: skip
