@@ -51,7 +51,7 @@ def object_facts(row: Row) -> dict[str, str]:
     why = has.get("reason") if status == "unregistered" else has.get("error")
     if status in DONE:
         why = WORDS["decided_by"].get(has.get("decided_by", ""))
-    facts["Result"] = WORDS["results"][status] + _completed(has) + (f": {why}" if why else "")
+    facts["Result"] = WORDS["results"][status] + _completed(has) + _of_shown(has) + (f": {why}" if why else "")
     if status == "unregistered":
         facts["Result"] += ". Perhaps it is not in this scene, or too little of it"
     if "height" in has:
@@ -97,6 +97,16 @@ def _completed(has: dict[str, Any]) -> str:
     """How much of an object's surface is there, to follow the word "completed"."""
     known = has["status"] == "registered" and "surface_missing" in has and has.get("surface_of") in OF_ALL
     return f" to {_surface(has)[0]}" if known else ""
+
+
+def _of_shown(has: dict[str, Any]) -> str:
+    """How much is there of what photos show: the rest is estimated, and behind a facade there may be none."""
+    shown = 1 - has.get("surface_never_seen", 0.0)
+    return (
+        f", {percent((1 - has['surface_missing']) / shown)} of what photos show"
+        if _completed(has) and 0 < shown < 1
+        else ""
+    )
 
 
 def _surface(has: dict[str, Any]) -> list[str]:
