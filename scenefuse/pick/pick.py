@@ -42,7 +42,7 @@ def pick(
     """Click what an object is in its photos, and points in its scene's, in a page of this machine's browser.
 
     The page writes the tables that the workflow reads: columns `prompts` and `fiducials` of the table of objects, and
-    `lengths` of the table of scenes. Run it in the folder of the project; its button Done or Ctrl-C ends it.
+    `lengths` of the table of scenes. Run it in the folder of the project; its button Done ends it.
 
     Args:
         object: name of the object, as in the table of objects; where it is left out, the only one.
@@ -69,11 +69,11 @@ def pick(
 
     def announce() -> None:
         if shows:
-            print(f"The page opens in a browser, or by {entrance.file}; Done or Ctrl-C ends it.", flush=True)
+            print(f"The page opens in a browser, or by {entrance.file}; clicks are saved, Done ends it.", flush=True)
             threading.Thread(target=webbrowser.open, args=(entrance.file.resolve().as_uri(),), daemon=True).start()
         else:
             print(f"{entrance.address}\nOpen this address in a browser of this machine, or of one from which", end=" ")
-            print(f"ssh -L {port}:{HOST}:{port} leads here; Done or Ctrl-C ends the page.", flush=True)
+            print(f"ssh -L {port}:{HOST}:{port} leads here; clicks are saved, Done ends it.", flush=True)
 
     app.on_startup(session.start)
     app.on_startup(announce)

@@ -127,5 +127,5 @@ def bytes_in(folder: Path) -> int:
 
 def size_text(size: float) -> str:
     """Bytes in words, such as 1.2 GB."""
-    unit, name = next((u, n) for u, n in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")) if size >= 0.1 * u or n == "MB")
+    unit, name = next((u, n) for u, n in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")) if size >= u or n == "MB")
     return f"{size / unit:.3g} {name}"

@@ -80,6 +80,7 @@ def test_a_line_says_when_the_disk_is_too_small_and_a_run_that_cannot_fit_is_ref
     free = shutil.disk_usage(tmp_path).free
     disk = lines({house: 10**6})[-1]
     assert "too little" not in disk and "about 1 MB (0 MB now)" in disk
+    assert "about 554 MB (0 MB now)" in lines({house: 554 * 10**6})[-1]
     assert lines({house: int(1.2 * free)})[-1].endswith(
         "; that is too little: free some space, or set `keep_maps: false`"
     )
