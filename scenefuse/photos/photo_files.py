@@ -172,16 +172,20 @@ def distinct_photos(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def _other_copies(folder: Path, names: list[str]) -> dict[str, str]:
-    """Photos of which another folder holds the same shot, by its name, time and camera, in more pixels; and that one.
+    """Photos of which there is the same shot, by name, time and camera, in more pixels, or not edited; and that one.
 
-    Cameras of a rig may agree in all that, but in the number of pixels too: of as many, only a camera's serial number
-    tells an edited copy from another photo.
+    Edited copies are named like their photo, with more behind: IMG_1-edited, IMG_1-2; those of iPhones IMG_E1. Photos
+    of one second may be so, too: then the fraction of the second tells. Cameras of a rig may agree in all that, but in
+    the number of pixels too: of as many of one name, only a camera's serial number tells an edited copy from another
+    photo.
     """
     from PIL.ExifTags import IFD, Base
 
-    by_name, found = defaultdict[str, list[str]](list), dict[str, str]()
-    for name in names:
-        by_name[_stem(name.rpartition("/")[2].casefold())].append(name)
+    stems = {name: _stem(name.rpartition("/")[2].casefold()) for name in names}
+    by_name, found, first = defaultdict[str, list[str]](list), dict[str, str](), ""
+    for stem, name in sorted((re.sub(r"^img_e(?=\d)", "img_", stem), name) for name, stem in stems.items()):
+        first = first if first and stem.startswith(first) else stem
+        by_name[first].append(name)
     for alike in (group for group in by_name.values() if len(group) > 1):
         largest = dict[tuple[str, ...], tuple[int, str]]()
         pixels = dict[str, tuple[int, tuple[str, ...]]]()
@@ -192,13 +196,14 @@ def _other_copies(folder: Path, names: list[str]) -> dict[str, str]:
                 # A clock that was not set writes blanks or zeros.
                 if (when := str(taken.get(Base.DateTimeOriginal) or "")).strip("0: \0"):
                     own = exif.get(Base.Model), taken.get(Base.BodySerialNumber, "")
-                    shot = tuple(map(str, (when, taken.get(Base.SubsecTimeOriginal), *own)))
+                    fraction = str(taken.get(Base.SubsecTimeOriginal) or "")
+                    shot = tuple(map(str, (when, fraction if fraction.strip("0 \0") else stems[name], *own)))
                     pixels[name] = image.width * image.height, shot
                     if pixels[name][0] > largest.get(shot, (0, ""))[0]:
                         largest[shot] = pixels[name][0], name
         for name, (count, shot) in pixels.items():
             most, first = largest[shot]
-            if count < most or (shot[-1] and name != first):
+            if count < most or (name != first and (shot[-1] or stems[name] != stems[first])):
                 found[name] = first
     return found
 

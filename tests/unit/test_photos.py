@@ -15,7 +15,7 @@ from PIL import Image, TiffImagePlugin
 import scenefuse.photos.photo_files
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.photos.frames import VideoSettings, list_photos
-from scenefuse.photos.photo_files import photo_files, stored_size, upright_size
+from scenefuse.photos.photo_files import distinct_photos, photo_files, stored_size, upright_size
 from scenefuse.photos.photos import check_unchanged, inspect_photo, read_photos, save_upright
 from scenefuse.photos.pictures import read_gray, read_raw, read_rgb, write_depth, write_picture
 from scenefuse.photos.positions import stated_position
@@ -130,6 +130,23 @@ def test_smaller_and_edited_copies_of_a_shot_are_left_out_and_photos_of_a_rig_st
     assert " ".join(names) == f"{there} undated/1.jpg"
     notes = value(read_json(tmp_path / "photos.json"), "notes")
     assert "2 photos are other copies of the same shots" in notes[0] and "(left/edited/3.jpg of left/3.jpg)" in notes[0]
+
+
+def test_edited_copies_in_a_photo_s_own_folder_are_left_out_and_photos_of_one_second_stay(tmp_path):
+    def shot(name, fraction, size=(40, 30)):
+        exif = Image.Exif()
+        exif[0x0110], exif[0x8769] = "Phone", {0x9003: "2026:05:01 12:00:00", 0x9291: fraction}
+        Image.new("RGB", size, (0, len(name), sum(name.encode()) % 256)).save(tmp_path / name, exif=exif)
+
+    for name in ("IMG_1.JPG", "IMG_E1.JPG", "IMG_1-edited.jpg", "IMG_1-2.jpg"):
+        shot(name, "123")
+    shot("IMG_E2.JPG", "200", (30, 30))
+    shot("IMG_2.JPG", "200")
+    for name, fraction in (("12.00.jpg", "000"), ("12.00-1.jpg", "000"), ("12.00-2.jpg", "456"), ("12.01.jpg", "123")):
+        shot(name, fraction)
+    names, (note,) = distinct_photos(tmp_path)
+    assert names == ["12.00-1.jpg", "12.00-2.jpg", "12.00.jpg", "12.01.jpg", "IMG_1.JPG", "IMG_2.JPG"]
+    assert note.startswith("4 photos are other copies of the same shots")
 
 
 @pytest.mark.parametrize("place", ["photos", "project/photos"])
