@@ -102,11 +102,9 @@ def _completed(has: dict[str, Any]) -> str:
 def _of_shown(has: dict[str, Any]) -> str:
     """How much is there of what photos show: the rest is estimated, and behind a facade there may be none."""
     shown = 1 - has.get("surface_never_seen", 0.0)
-    return (
-        f", {percent((1 - has['surface_missing']) / shown)} of what photos show"
-        if _completed(has) and 0 < shown < 1
-        else ""
-    )
+    if not _completed(has) or not 0 < shown < 1:
+        return ""
+    return f" ({percent((1 - has['surface_missing']) / shown)} of what photos show)"
 
 
 def _surface(has: dict[str, Any]) -> list[str]:

@@ -732,7 +732,7 @@ def test_a_scene_to_which_nothing_was_added_is_not_called_completed(results):
 
 def test_what_is_completed_in_part_alone_is_not_called_completed():
     row = {"object": "house", "status": "registered", "surface_missing": 0.913, "surface_never_seen": 0.913}
-    assert object_facts(row)["Result"] == "Found in the scene and completed to 8.7 %, 100 % of what photos show"
+    assert object_facts(row)["Result"] == "Found in the scene and completed to 8.7 % (100 % of what photos show)"
     facts = object_facts(row | {"surface_missing": 1.0, "surface_never_seen": 1.0})
     assert facts["Result"].endswith("completed to 0.0 %") and facts["Surface"].startswith("0.0 % is there, 100.0 %")
 
@@ -744,7 +744,7 @@ def test_what_is_there_of_a_cloud_without_masks_is_not_said_of_the_whole_object(
     assert facts["Result"] == "Found in the scene and completed" and verdict(row) == "completed"
     assert facts["Surface"].startswith("98.0 % of what its own cloud holds is there, 2.0 % is missing")
     whole = object_facts(row | {"surface_of": "its surface"})
-    assert "completed to 98.0 %, 100 % of what photos show" in whole["Result"]
+    assert "completed to 98.0 % (100 % of what photos show)" in whole["Result"]
 
 
 def test_how_much_of_what_is_there_photos_cannot_measure_is_said():
@@ -769,7 +769,7 @@ def test_a_position_is_as_exact_as_what_is_known_of_it_says():
 def test_the_result_and_the_surface_of_an_object_name_the_same_share():
     row = {"object": "house", "status": "registered", "surface_missing": 0.01152, "surface_never_seen": 0.00907}
     facts = object_facts(row | {"surface_contradicted": 0.00245})
-    assert "completed to 98.8 %, 99.8 % of what photos show" in facts["Result"]
+    assert "completed to 98.8 % (99.8 % of what photos show)" in facts["Result"]
     assert facts["Surface"].startswith("98.8 % is there")
 
 
