@@ -46,7 +46,7 @@ SIDES = {
 
 @dataclass(frozen=True)
 class Drawing:
-    """A parallel projection of a surface; the bands are (H, W), the first row at the top.
+    """A parallel projection of a surface's outside; the bands are (H, W), the first row at the top.
 
     Attributes:
         colors: (H, W, 4) uint8 RGBA.
@@ -90,6 +90,8 @@ def draw(surface: Surface, painted: Painted | None, axes: Array, pixel: float) -
         origins = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, high[2] + pixel)])
         down, first = np.tile([0.0, 0, -1], (x.size, 1)), row[0] * width
         hit = cast(scene, origins, down)
+        # Nobody measured what the back of a surface hides, a facade's from behind for instance.
+        hit["t_hit"][hit["primitive_normals"][:, 2] < 0] = np.inf
         on = np.flatnonzero(np.isfinite(hit["t_hit"]))
         face, at = hit["primitive_ids"][on].astype(np.int64), first + on
         corner = surface.faces[face]
