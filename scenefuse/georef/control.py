@@ -181,23 +181,30 @@ class Control:
     located: list[LocatedPoint]
     notes: list[str]
 
+    @property
+    def only_checks(self) -> bool:
+        """Whether all points are check points, as beside RTK positions."""
+        return all(s.point.check for s in self.located)
+
 
 def read_control_points(path: Path, model: pycolmap.Reconstruction, photos: list[Photo]) -> Control:
     """Read surveyed points and find them in a model.
 
     Raises:
-        StageError: what `read_control` and `locate_points` say; fewer than three control points that can be used.
+        StageError: what `read_control` and `locate_points` say; fewer than three control points that can be used, and
+            others than check points.
     """
     surveyed = read_control(path)
     located, notes = locate_points(surveyed, model, {p.name: (p.width, p.height) for p in photos})
     good = [s for s in located if not (s.problem or s.point.check) and np.isfinite(s.point.position).all()]
-    if len(good) < FIXING_POINTS:
+    found = Control(path, grid_name(surveyed.crs), located, notes)
+    if len(good) < FIXING_POINTS and not found.only_checks:
         reasons = "; ".join(f"{s.point.name}: {s.problem}" for s in located if s.problem and not s.point.check)
         raise StageError(
             f"{path}: {len(good)} control points with a height can be used, {FIXING_POINTS} are needed"
             f"{f' ({reasons})' if reasons else ''}; click more points, each in two photos or more"
         )
-    return Control(path, grid_name(surveyed.crs), located, notes)
+    return found
 
 
 def locate_points(

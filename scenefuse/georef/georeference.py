@@ -12,8 +12,8 @@ import pycolmap
 from scenefuse.cloud.crs import check_in_area, grid_name, projected_crs
 from scenefuse.cloud.import_cloud import near_origin
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, value, write_json
-from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3, box_corners, fit_sim3
-from scenefuse.georef.control import Control, read_control_points
+from scenefuse.core.transforms import FIXING_POINTS, MAX_DEVIATIONS, Array, Sim3, box_corners, fit_sim3
+from scenefuse.georef.control import CHECK, Control, read_control_points
 from scenefuse.georef.on_cloud import lay_on_cloud
 from scenefuse.georef.placement import (
     MAX_GPS_OFF_M,
@@ -99,8 +99,8 @@ def georegister(
     up, cue = estimate_up(rotations, centres, there)
     surveyed = None if control is None else read_control_points(control, model, listed)
     place = read_place(read_json(sparse_json))
-    if place is not None and surveyed is None:
-        found = placed_as_given(place, model, gps)
+    if place is not None and (surveyed is None or surveyed.only_checks):
+        found = replace(placed_as_given(place, model, gps), control=surveyed)
     else:
         found = georeference(gps, surveyed, up, settings, seed, sure_up=cue == "headings")
     if crs is not None and cloud is None:
@@ -159,10 +159,13 @@ def georeference(
         settings: when GPS is used.
         seed: of RANSAC.
         sure_up: whether `up` is a measurement (`estimate_up`: "headings"), better than inexact heights.
+
+    Raises:
+        StageError: what `place_by_control` and `beside_gps` say; check points of a scene that nothing else places.
     """
     by_gps = settings.use_gps and len(gps.names) >= PHOTOS_OF_ONE_ERROR
     gps, zeros = of_one_zero(gps, MAX_DEVIATIONS * settings.gps_accuracy_m) if by_gps else (gps, "")
-    if control is not None:
+    if control is not None and not control.only_checks:
         positions = np.array([s.point.position for s in control.located])
         frame = replace(local_frame(positions), grid=control.grid)
         there, where = frame.apply(positions), str(control.path)
@@ -176,9 +179,17 @@ def georeference(
         frame = local_frame(gps.positions)
         there, sd_m = frame.apply(gps.positions), float(np.median(gps.sd_m[:, 0]))
         placement = place_by_gps(gps.centres, there, up, settings, seed, sd_m, sure_up)
-        return Georeference(replace(placement, reason=placement.reason + zeros), frame, gps)
-    reason = f"{len(gps.names)} registered photos have a GPS position, {PHOTOS_OF_ONE_ERROR} are needed"
-    return Georeference(upright(up, reason if settings.use_gps else "GPS is switched off"), None, gps)
+        frame = frame if control is None else replace(frame, grid=control.grid)
+        found = Georeference(replace(placement, reason=placement.reason + zeros), frame, gps, control)
+    else:
+        reason = f"{len(gps.names)} registered photos have a GPS position, {PHOTOS_OF_ONE_ERROR} are needed"
+        found = Georeference(upright(up, reason if settings.use_gps else "GPS is switched off"), None, gps, control)
+    if control is not None and found.placement.status != "georeferenced":
+        raise StageError(
+            f"{control.path} holds check points ({CHECK}...) alone, and nothing else places the scene:"
+            f" {found.placement.reason}; name {FIXING_POINTS} of them without {CHECK}, as control points"
+        )
+    return found
 
 
 def placed_as_given(place: Place, model: pycolmap.Reconstruction, gps: GpsCameras) -> Georeference:

@@ -160,7 +160,7 @@ def lay_on_cloud(
     moved, said = Sim3.identity(), f"{found.placement.reason}; so they fit {cloud.name}"
     # Control points are as exact as a cloud, and their coordinates may well be of the same survey.
     fit = fit_to_cameras(there, model)
-    if found.control is None or misfit(fit):
+    if not found.used.any() or misfit(fit):
         moved = _onto(there, own, str(cloud))
         off = moved.apply(own.mean(0)) - own.mean(0)
         turned, scaled = rotation_angle_deg(moved.rotation), 100 * (moved.scale - 1)

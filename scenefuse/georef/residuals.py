@@ -42,6 +42,11 @@ class Georeference:
         return [] if self.control is None else self.control.located
 
     @property
+    def used(self) -> NDArray[np.bool_]:
+        """(P,) the control points that place it, of the surveyed points."""
+        return self.placement.used if len(self.placement.used) else np.zeros(len(self.located), dtype=bool)
+
+    @property
     def metric(self) -> bool:
         """Whether the model is in metres."""
         return self.placement.status != "upright"
@@ -71,6 +76,8 @@ def residuals_of(model: pycolmap.Reconstruction, found: Georeference, lengths: L
     names, positions = found.gps.names, found.frame.apply(found.gps.positions) - found.placement.gps_shift
     centres = np.array([model.find_image_with_name(name).projection_center() for name in names]).reshape(-1, 3)
     target = found.frame.apply(np.array([s.point.position for s in found.located]).reshape(-1, 3))
+    if found.placement.heights == "relative":
+        target[:, 2] = np.nan
     places, rms_px = seen_at(found.located, model)
     return Residuals(centres - positions, places - target, rms_px, lengths)
 
@@ -85,7 +92,7 @@ def write_residuals(path: Path, found: Georeference, left: Residuals) -> None:
             rows.append(["length", name, used, error])
     if found.placement.status == "georeferenced":
         for row, (point, error) in enumerate(zip((s.point for s in found.located), left.points)):
-            kind, used = "check point" if point.check else "control point", yes_no[bool(found.placement.used[row])]
+            kind, used = "check point" if point.check else "control point", yes_no[bool(found.used[row])]
             counts = [len(point.clicks), left.points_px[row]]
             rows.append([kind, point.name, used, _length(error), *error, *point.sd_m, *counts])
         chosen = found.placement.inliers if len(found.placement.inliers) else np.zeros(len(found.gps.names), bool)
@@ -104,7 +111,7 @@ def _length(error: Array) -> float:
 def georeference_report(found: Georeference, left: Residuals, cue: str) -> dict[str, Any]:
     """Content of georeference.json; what matters of it is printed."""
     placement, unit = found.placement, "m" if found.metric else "scene units"
-    measured_by = "control points" if found.control else "GPS" if len(placement.inliers) else "given cameras"
+    measured_by = "control points" if found.used.any() else "GPS" if len(placement.inliers) else "given cameras"
     print(f"{placement.status}: {placement.reason}; unit: {unit}", flush=True)
     transform = placement.local_from_model
     content = {
@@ -158,7 +165,7 @@ def _of_points(found: Georeference, control: Control, left: Residuals) -> dict[s
         print(f"note: {note}", flush=True)
     check = np.array([s.point.check and not s.problem for s in control.located])
     content: dict[str, Any] = {"control_notes": quantity(notes, "")}
-    for kind, rows in (("control", found.placement.used), ("check", check)):
+    for kind, rows in (("control", found.used), ("check", check)):
         horizontal, vertical = rms(left.points[rows, :2]), rms(left.points[rows, 2:])
         content |= {
             f"{kind}_points": quantity(int(rows.sum()), "1"),
@@ -173,7 +180,7 @@ def _of_points(found: Georeference, control: Control, left: Residuals) -> dict[s
 
 def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str]:
     """A note that names the control points, the worst first, whose errors are too large for what is stated of them."""
-    used = found.placement.used
+    used = found.used
     sd_m = np.array([s.point.sd_m for s in control.located]).reshape(-1, 2)
     horizontal = np.linalg.norm(left.points[:, :2], axis=1) / sd_m[:, 0]
     ratio = np.where(used, np.fmax(horizontal, np.abs(left.points[:, 2]) / sd_m[:, 1]), 0.0)
@@ -190,8 +197,8 @@ def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str
 def _near_a_line(found: Georeference, control: Control, left: Residuals) -> list[str]:
     """A note where control points without GPS lie so near to one line that heights as far beside it as they reach along
     it (RMS) are known much worse than is stated of theirs."""
-    rows = found.placement.used & np.isfinite(left.points).all(1)
-    if found.frame is None or found.placement.inliers.any():
+    rows = found.used & np.isfinite(left.points).all(1)
+    if found.frame is None or found.placement.inliers.any() or not rows.any():
         return []
     at = found.frame.apply(np.array([s.point.position for s in control.located])[rows])
     along, across, _ = np.linalg.svd(at - at.mean(0), compute_uv=False) / [np.sqrt(len(at)), 1.0, 1.0]

@@ -105,6 +105,20 @@ def test_control_points_give_metres_and_check_points_are_only_measured(tmp_path,
     assert value(again, "check_rms_vertical_m") == pytest.approx(5 / np.sqrt(2), abs=0.1)
 
 
+def test_check_points_alone_measure_what_rtk_positions_place(tmp_path, model):
+    lines = gcp_lines(FLIGHT, PLACES, [f"CHK-{name}" for name in "abcdefgh"], noise_px=0.3)
+    exact = FLIGHT.photos(noise_m=0.02, sd_m=0.02, seed=1)
+    report, found, rows = georeferenced(tmp_path / "a", model, exact, lines)
+    alone, same, _ = georeferenced(tmp_path / "b", model, exact)
+    assert (value(report, "control_points"), value(report, "check_points")) == (0, 8)
+    assert value(report, "check_rms_horizontal_m") < 0.05 and value(report, "check_rms_vertical_m") < 0.1
+    assert {row["used"] for name, row in rows.items() if name.startswith("CHK")} == {"no"}
+    np.testing.assert_allclose(camera_poses(found)[2], camera_poses(same)[2], atol=1e-9)
+    assert value(report, "up_cue") == value(alone, "up_cue") == "GPS"
+    with pytest.raises(StageError, match="check points .* alone, and nothing else places .*: 0 registered photos have"):
+        georeferenced(tmp_path / "c", model, without_gps(), lines)
+
+
 def test_points_with_larger_stated_deviations_weigh_less(tmp_path, model):
     right = gcp_lines(FLIGHT, PLACES, NAMES)
     high = changed(right, "e", 2, lambda z: z + 0.4)
