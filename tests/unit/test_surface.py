@@ -337,6 +337,8 @@ def test_a_photo_fades_out_towards_where_it_ends():
     middle = round(-drawing.left * 180)
     near = profile[middle - 50 : middle + 50]
     assert np.ptp(near) > 20 and np.abs(np.diff(near)).max() < 8
+    # From behind nothing of it was measured.
+    assert not draw(surface, picture, np.diag([1.0, -1, -1]), 0.02).colors.any()
 
 
 # A plane that cuts the ball half a radius in front of its middle, towards east and a little north: towards which, and
