@@ -13,14 +13,15 @@ from scenefuse.cloud.clouds import Cloud, read_cloud, sampled_rows
 from scenefuse.cloud.readers.text import TEXTS
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity
-from scenefuse.core.transforms import UP, Array, Sim3, uncertainty_quantities
+from scenefuse.core.transforms import MAX_DEVIATIONS, UP, Array, Sim3, uncertainty_quantities
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import MIN_POINTS, around_marks, crop_marked
 from scenefuse.geometry.icp import ScaleRange
-from scenefuse.geometry.surface import SCORE_FRACTION
+from scenefuse.geometry.surface import SCORE_FRACTION, with_queries
 from scenefuse.marks.clicks import ScenePoints, read_points
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg
+from scenefuse.register.likelihood import certified
 from scenefuse.register.problem import (
     SURFACE_POINTS,
     Constraints,
@@ -34,6 +35,7 @@ from scenefuse.register.problem import (
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.register_object import pose_quantities, rests_on
 from scenefuse.register.score import DISTINCT_SHIFT, AgreementSettings, Hypothesis, lead, registration_metrics, score
+from scenefuse.register.uncertainty import common_error
 from scenefuse.two_clouds.places import MAX_PLACES, likely_places
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
@@ -114,6 +116,8 @@ class Registration:
         scales: the scale prior.
         agreement: fitness, RMSE and normals at the best pose; see `registration_metrics`.
         unit: of the scene's lengths.
+        fitting_scale: at which the clouds fit best, and its standard deviation, where one that was held is off by more
+            than four of these.
         sides_estimated: whether normals are inwards, and the sides of both clouds' were estimated.
     """
 
@@ -122,6 +126,7 @@ class Registration:
     scales: ScaleRange
     agreement: dict[str, dict[str, Any]]
     unit: str = "scene units"
+    fitting_scale: tuple[float, float] | None = None
     sides_estimated: bool = False
 
     @property
@@ -191,7 +196,24 @@ def refined(found: Search, settings: RegistrationSettings, unit: str) -> Registr
     """The fine registration of what a search found, and the decision."""
     starts = [(hypothesis.pose, hypothesis.source) for hypothesis in found.hypotheses]
     outcome = refine_hypotheses(found.problem, starts, settings.fine) if starts else None
-    return Registration(outcome, found.origins, found.problem.scales, {}, unit)
+    fitting = None
+    if outcome is not None and outcome.decision.registered and found.problem.scales.width == 0:
+        fitting = _fitting_scale(found.problem, outcome.ranked[0].pose, settings.fine.voxel_fraction)
+    return Registration(outcome, found.origins, found.problem.scales, {}, unit, fitting)
+
+
+def _fitting_scale(problem: Problem, pose: Sim3, fraction: float) -> tuple[float, float] | None:
+    """See `Registration`; of a pose whose scale was held, by points that are a fraction of the diagonal apart."""
+    free, diagonal = ScaleRange(pose.scale, ScaleSettings().width_log), problem.scene.diagonal
+    surfaces = problem.surfaces(pose.scale, fraction, SURFACE_POINTS)
+    obj, scene = (with_queries(surface, SURFACE_POINTS // 4, problem.seed) for surface in surfaces)
+    found = certified(obj, scene, pose, free, fraction * diagonal, diagonal, problem.seed)
+    if found is None:
+        return None
+    common = common_error(obj, scene, found[0], free, SCORE_FRACTION * diagonal)
+    deviation = float(np.sqrt(found[1].covariance[6, 6] + common[6, 6]))
+    off = abs(np.log(found[0].scale / pose.scale)) > MAX_DEVIATIONS * deviation
+    return (found[0].scale, found[0].scale * deviation) if off else None
 
 
 def with_agreement(

@@ -116,6 +116,7 @@ def register(
     notes = given.notes
     for note in notes:
         print(f"note       {note}", flush=True)
+    known_before = len(notes)
     if scales is not None:
         _check_size(scales, given)
     unit, _ = unit_and_name(las_crs(scene))
@@ -126,10 +127,17 @@ def register(
         given.object, whole, settings, seed,
         ups=given.ups, up_in_scene=known.ups()[1], scales=scales, unit=unit, marked=marked, progress=_progress,
     )  # fmt: skip
+    if found.fitting_scale is not None:
+        fit, deviation = found.fitting_scale
+        notes.append(
+            f"--scale holds the scale at {found.scales.centre:.6g}, and the clouds fit best at {fit:.6g}, standard"
+            f" deviation {deviation:.2g}: unless the first is sure, give a --scale-range around both"
+        )
     if found.sides_estimated:
         inwards = f"most normals of {object} or {scene} face inwards"
         notes.append(f"{inwards}: it is found with the sides of both estimated from the points")
-        print(f"note       {notes[-1]}", flush=True)
+    for note in notes[known_before:]:
+        print(f"note       {note}", flush=True)
     if not marked:
         searched = f"{given.searched}, and the parts of it that look like the object"
         given = replace(given, scene=replace(given.scene, part=part), searched=searched)

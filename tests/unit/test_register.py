@@ -107,6 +107,11 @@ def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path, monkeypat
     assert abs(scale) < 1e-6 and angle < 2 and shift < 0.01
     assert "8 fiducials" in value(content, "searched") and "ground removed" in value(content, "searched")
     assert value(content, "tilt_deg") < 5
+    assert not any("fit best" in note for note in value(content, "notes"))
+    # Held 4 % off, as by a wrong scale bar.
+    assert register(**files, known=replace(known, scale=1.04 * true), out=tmp_path / "off") == 0
+    (note,) = [note for note in value(read_json(tmp_path / "off/transform.json"), "notes") if "fit best" in note]
+    assert float(note.split("fit best at ")[1].split(",")[0]) == pytest.approx(true, rel=0.015)
     with pytest.raises(StageError, match="at a scale of 1000 the object would be .* across, and the searched part"):
         register(**files, known=replace(known, scale=1000.0), out=tmp_path / "other")
     placed = read_cloud(out / "object_in_scene.ply").points
