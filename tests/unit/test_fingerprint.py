@@ -1,11 +1,12 @@
 import ast
 import os
 import shutil
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
-from scenefuse.core.fingerprint import files_fingerprint, fingerprint, forget, imported_names
+from scenefuse.core.fingerprint import DISTRIBUTIONS, files_fingerprint, fingerprint, forget, imported_names, reached
 
 
 @pytest.fixture
@@ -80,6 +81,15 @@ def test_an_upgraded_package_changes_what_imports_it_and_nothing_else(project, m
         old, versions[name] = versions[name], "9.9"
         assert project(**start) != before, name
         versions[name] = old
+
+
+def test_the_versions_of_all_packages_that_stages_import_are_known():
+    root, installed = Path(__file__).parents[2], metadata.packages_distributions()
+    files = frozenset().union(*(reached(script, root) for script in root.glob("scripts/*/*.py")))
+    names = {name.split(".")[0] for file in files for name in imported_names(file.read_text(), file, root)}
+    names = {name for name in names & installed.keys() if not (root / name).is_dir()}
+    found = {name: {like.lower() for like in installed[name]} for name in names}
+    assert [name for name, held in found.items() if held.isdisjoint(DISTRIBUTIONS.get(name, (name,)))] == []
 
 
 def test_imports_in_brackets_and_over_lines_are_followed(project):
