@@ -75,7 +75,7 @@ def project(tmp_path, snakemake, request):
             os.utime(tmp_path / name / f"{index}.jpg", (1e9, 1e9))
     shutil.copy(tmp_path / "barn/2.jpg", tmp_path / "spare.jpg")
     (tmp_path / "barn/2.jpg").write_bytes(b"\xff\xd8\xff\xe0 broken")
-    (tmp_path / "scenes.tsv").write_text("scene\tphotos\nyard\tflight\n")
+    (tmp_path / "scenes.tsv").write_text("scene\tphotos\tmade_by\nyard\tflight\tA {B} $C\n")
     rows = [f"{name}\tyard\t{name}\tclicks.tsv\tprompts.tsv" for name in ("shed", "barn")]
     (tmp_path / "objects.tsv").write_text("\n".join(["object\tscene\tphotos\tfiducials\tprompts", *rows]) + "\n")
     for name in ("clicks.tsv", "prompts.tsv"):
@@ -110,7 +110,7 @@ def test_a_failed_object_keeps_nobody_back_and_is_taken_in_once_it_is_mended(pro
     text = " ".join((summary / "summary.txt").read_text().split())
     assert "Completed with shed;" in text and "object barn: failed" in text
     page = (summary / "report.html").read_text()
-    assert '>barn<span class="badge no">failed<' in page and "2.jpg" in page
+    assert '>barn<span class="badge no">failed<' in page and "2.jpg" in page and "A {B} $C" in page
     assert 'aria-label="3D view of scene yard"' in page
 
     # What is there can be handed over, as `scenefuse export` does.

@@ -120,6 +120,12 @@ def summary_command(log, options=""):
     return f"{command} --summary results/summary &> {log}"
 
 
+def run_summary_command(log, options=""):
+    """Write the summary outside of a rule. (`shell` replaces what stands in braces, but not in what it puts there.)"""
+    command = summary_command(log, options)
+    shell("mkdir -p results/logs/write_summary; {command} || true")
+
+
 def forget_failures():
     """Write a summary that names jobs which failed in an earlier run again, without them, where this run does not: `scenefuse
     export` makes none."""
@@ -127,7 +133,7 @@ def forget_failures():
     if "write_summary" in {job.rule.name for job in workflow.dag.needrun_jobs()}:
         return
     if text.is_file() and "\njobs that failed\n" in text.read_text():
-        shell(summary_command("results/logs/write_summary/onstart.log") + " || true")
+        run_summary_command("results/logs/write_summary/onstart.log")
 
 
 def closing_lines():
@@ -246,11 +252,11 @@ def run_anyway(job, options=""):
     """Run a job whose inputs are not all there; returns whether it ended well. Its outputs stay marked as incomplete: the next run
     makes them anew."""
     workflow.persistence.started(job)
-    folders = {str(Path(file).parent) for file in (*job.log, job.benchmark)}
+    folders = " ".join({str(Path(file).parent) for file in (*job.log, job.benchmark)})
     command = f"{job.shellcmd.removeprefix('exec ')}{options}"
     try:
         # The benchmark says that the job has ended well.
-        shell(f"mkdir -p {' '.join(folders)}; {command} && touch {job.benchmark}")
+        shell("mkdir -p {folders}; {command} && touch {job.benchmark}")
     except subprocess.CalledProcessError:
         return False
     return True

@@ -198,7 +198,7 @@ rule write_summary:
         mem_mb=2000,
         runtime=10,
     params:
-        command=summary_command("results/logs/write_summary/all.log"),
+        command=lambda wildcards: summary_command("results/logs/write_summary/all.log"),
         code=code("report/write_summary.py"),
     message:
         "Summary: tables, texts"
@@ -295,11 +295,7 @@ onerror:
         finish_scenes()
     for job in held_up("write_summary"):
         workflow.persistence.started(job)
-    shell(
-        "mkdir -p results/logs/write_summary; "
-        + summary_command("results/logs/write_summary/onerror.log", failed_logs())
-        + " || true"
-    )
+    run_summary_command("results/logs/write_summary/onerror.log", failed_logs())
     for job in held_up("compare_with_paper") if keep_going else []:
         # If it fails, the page may not show one of before.
         for output in job.output:
