@@ -119,15 +119,9 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
 
 
 def _renew_report(others: list[str]) -> int:
-    """Show in the page what was exported; the exit status. A run that makes the page prints where it is."""
-    from scenefuse.report.facts import closing_lines
-
-    shown = REPORT.stat().st_mtime
-    page = [*RUN, str(REPORT), *others, "--quiet", "all", "--allowed-rules", "write_report"]
-    ended = subprocess.run(page).returncode
-    if not ended and REPORT.stat().st_mtime == shown:
-        print(closing_lines(REPORT.parent), flush=True)
-    return ended
+    """Show in the page what was exported, of which not all is an input of its rule; the exit status."""
+    page = ["--quiet", "all", "--forcerun", "write_report", "--allowed-rules", "write_report"]
+    return subprocess.run([*RUN, str(REPORT), *others, *page]).returncode
 
 
 def write_zip(page: Path, exported: Iterable[Path], file: Path) -> None:
