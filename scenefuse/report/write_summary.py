@@ -55,7 +55,7 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
 
     Args:
         run: see RunInputs.
-        summary: output folder; of other files in it, report.pdf goes, and drawings of an earlier fusion with it.
+        summary: output folder; of other files in it, report.pdf goes, and other exports of earlier results with it.
     """
     found = summarise(run)
     tables = {
@@ -75,9 +75,13 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
     print(texts["summary"], flush=True)
     # What was exported of earlier results may not be handed over as of these.
     (summary / "report.pdf").unlink(missing_ok=True)
-    for folder in run.objects:
-        if not is_current(folder / "drawings/drawings.pdf", folder / "fused.ply"):
-            shutil.rmtree(folder / "drawings", ignore_errors=True)
+    made_of = [(folder / "drawings", "drawings.pdf", "fused.ply") for folder in run.objects]
+    for folder in run.scenes:
+        made_of += [(folder / "tiles", "points/tileset.json", "completed.ply")]
+        made_of += [(folder / "cameras", "cameras.xml", "completed.ply")]
+    for folder, file, source in made_of:
+        if not is_current(folder / file, folder.parent / source):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def registration_table(run: RunSummary) -> pd.DataFrame:

@@ -350,15 +350,16 @@ def test_an_empty_run_is_a_summary_too(tmp_path):
 
 
 def test_a_summary_removes_what_was_exported_of_earlier_results(results):
-    exported = [results / "objects" / name / "drawings/drawings.pdf" for name in ("house", "balloon")]
-    for path in (*exported, results / "summary/report.pdf"):
-        path.parent.mkdir(exist_ok=True)
-        path.touch()
-        fused = path.parents[1] / "fused.ply"
-        fused.touch()
-        os.utime(path, (fused.stat().st_mtime + 60 * (-1) ** ("house" in path.parts),) * 2)
+    made_of = [(f"objects/{name}/drawings/drawings.pdf", f"objects/{name}/fused.ply") for name in ("house", "balloon")]
+    of_scene = ("tiles/points/tileset.json", "cameras/cameras.xml")
+    made_of += [(f"scenes/demo/{name}", "scenes/demo/completed.ply") for name in of_scene]
+    for age_s, (made, source) in zip((60, -60, 60, -60), made_of):
+        for path in (results / made, results / source, results / "summary/report.pdf"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+        os.utime(results / made, ((results / source).stat().st_mtime - age_s,) * 2)
     assert not (summarise(results) / "report.pdf").exists()
-    assert [path.exists() for path in exported] == [False, True]
+    assert [(results / made).exists() for made, _ in made_of] == [False, True, False, True]
 
 
 def test_the_last_error_is_that_of_the_named_object(tmp_path):
