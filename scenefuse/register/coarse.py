@@ -12,7 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
-from scenefuse.geometry.icp import MAX_TRIPLES, RANSAC_POSES, ScaleRange, refine_points, triples_of_one_scale
+from scenefuse.geometry.icp import (
+    MAX_TRIPLES,
+    MIN_EDGE_RATIO,
+    RANSAC_POSES,
+    ScaleRange,
+    refine_points,
+    triples_of_one_scale,
+)
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare, with_grid, with_queries
 from scenefuse.register.problem import SURFACE_POINTS, Problem
 from scenefuse.register.score import RECALL_WEIGHT, Hypothesis, best_distinct, score
@@ -157,8 +164,8 @@ def ransac_similarities(
 ) -> list[Sim3]:
     """The `keep` similarities with most inliers among random triples of matches, most first.
 
-    A triple is kept when its three edges agree on one scale to 10 % (the edge-length check, with a free but bounded
-    scale) and, where both up directions are known, when it leaves the object upright.
+    A triple is kept when its three edges agree on one scale to 10 % (the edge-length check), which lies as near to the
+    bounds, and, where both up directions are known, when it leaves the object upright.
 
     Args:
         x: (M, 3) matched points of the object.
@@ -175,7 +182,9 @@ def ransac_similarities(
         return []
     rng = np.random.default_rng(seed)
     triples, edges, middle = triples_of_one_scale(x, y, samples, rng)
-    good = (edges[1].min(1) > 3 * tau) & (np.abs(np.log(middle / scales.centre)) <= scales.width + 0.05)
+    good = (edges[1].min(1) > 3 * tau) & (
+        np.abs(np.log(middle / scales.centre)) <= scales.width - np.log(MIN_EDGE_RATIO)
+    )
     triples, middle = triples[good], middle[good]
     if len(triples) == 0:
         return []

@@ -184,6 +184,13 @@ def test_ransac_finds_a_similarity_among_false_matches():
     assert np.allclose(best.matrix, truth.matrix, atol=1e-6)
 
 
+def test_at_a_known_scale_matches_are_as_rough_as_at_an_unknown_one():
+    x = np.random.default_rng(1).normal(size=(3, 3))
+    for longer, count in ((1.08, 1), (1.15, 0)):
+        found = ransac_similarities(x, longer * x, ScaleRange(1.0, 0.0), 0.05, 500, 1, 0, None, 10.0)
+        assert len(found) == count and all(pose.scale == 1.0 for pose in found)
+
+
 def test_mutual_matches_are_each_others_nearest():
     a = np.array([[0.0, 0.0], [5.0, 0.0], [5.2, 0.0]])
     b = np.array([[5.1, 0.0], [0.1, 0.0]])
