@@ -201,7 +201,9 @@ def _run_workflow(project: Path, targets: list[str], cores: int | None) -> None:
         StageError: it failed.
     """
     cores = cores or os.cpu_count() or 1
-    words = ["--configfile", str(OWN_SETTINGS), "--cores", str(cores), *targets]
+    # Snakemake refuses a file without keys.
+    own = ["--configfile", str(OWN_SETTINGS)] if read_differences(project / OWN_SETTINGS) else []
+    words = [*own, "--cores", str(cores), *targets]
     command, log = snakemake_command(words, [project / OWN_SETTINGS]), project / LOG
     log.parent.mkdir(parents=True, exist_ok=True)
     print(f"Running on {cores} {'core' if cores == 1 else 'cores'}; all that Snakemake says: {log}", flush=True)

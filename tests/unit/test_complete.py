@@ -125,6 +125,16 @@ def test_clicks_are_of_the_objects_with_photos_beside_one_that_is_a_cloud(two_fo
     assert rows["close"]["prompts"] == str(two_folders / "clicks.tsv") and not rows["wall"]["prompts"]
 
 
+def test_settings_of_which_every_line_is_a_comment_are_not_given_to_snakemake(two_folders, monkeypatch):
+    given: list[list[str]] = []
+    monkeypatch.setattr(complete, "snakemake_command", lambda words, _: given.append(words) or ["true"])
+    monkeypatch.setattr(complete, "closing_lines", str)
+    for _ in range(2):
+        run("close", prompts=(Path("clicks.tsv"),))
+        Path("flight_completed/config/config.yaml").write_text("# gpu: 1\n")
+    assert [words.count("--configfile") for words in given] == [1, 0]
+
+
 def test_a_second_run_in_the_same_project_is_refused_and_leaves_the_first_ones_log(two_folders, workflow):
     workflow(SUMMARY)
     run("close", prompts=(Path("clicks.tsv"),))
