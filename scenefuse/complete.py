@@ -148,9 +148,9 @@ def _without_clicks(project: Path, cores: int | None) -> list[str]:
         needed = row.get("photos") and not row.get("masks") and (row.get("prompts") or not row.get("cloud"))
         if needed and not (clicks.is_file() and len(read_cells(clicks)) > 1):
             found.append(name)
-            frames = Path("results/objects", name, "photos.json")
-            if (project / row["photos"]).is_file() and not (project / frames).is_file():
-                _run_workflow(project, [str(frames)], cores)
+            if (project / row["photos"]).is_file():
+                # Those of a video that was replaced since are made anew.
+                _run_workflow(project, [f"results/objects/{name}/photos.json"], cores)
     return found
 
 

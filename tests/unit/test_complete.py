@@ -213,6 +213,18 @@ def test_a_scene_may_be_a_video(two_folders, workflow):
     assert row["photos"] == str(two_folders / "flown.MP4") and not row["cloud"]
 
 
+def test_the_frames_to_click_in_are_those_of_the_video_that_is_there(two_folders, monkeypatch):
+    film(two_folders / "walk.mp4")
+    made: list[str] = []
+    monkeypatch.setattr(complete, "snakemake_command", lambda words, _: made.append(words[-1]) or ["true"])
+    for count in (1, 2):
+        with pytest.raises(StageError, match="walk has no clicks yet"):
+            run("walk.mp4")
+        assert made == ["results/objects/walk/photos.json"] * count
+        Path("flight_completed", made[0]).parent.mkdir(parents=True, exist_ok=True)
+        Path("flight_completed", made[0]).write_text("{}")
+
+
 def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
     for name in ("empty", "filmed", "tiles"):
         (two_folders / name).mkdir()
