@@ -38,7 +38,7 @@ LIBRARY = Path(__file__).resolve().parent.parent
 # Files in the assets/ folder beside a module that imports this are part of its code.
 ASSETS_READER = "importlib.resources"
 OWN_SOURCE = Path(__file__).read_bytes()  # an edit here forgets all that is remembered
-# A file of a user up to this size is read whole; of a larger one only size and date are looked at.
+# A file of a user up to this size is read whole; of a larger one size, date and beginning are looked at.
 MAX_READ_BYTES = 200_000
 
 
@@ -88,19 +88,22 @@ def _modules(script: Path, root: Path) -> dict[Path, _Module]:
 
 @functools.cache
 def files_fingerprint(paths: tuple[str, ...]) -> str:
-    """Twelve hex digits that identify files by their names and their contents, large ones by name, size and date."""
+    """Twelve hex digits that identify files by their names and contents; large ones by name, size, date, beginning."""
     return _digest("\n".join(f"{path} {_state(Path(path))}" for path in sorted(paths)))
 
 
 def _state(path: Path) -> str:
     if path.is_dir():
         return "\n".join(f"{file} {_state(file)}" for file in sorted(path.rglob("*")) if file.is_file())
-    if not path.is_file():
+    # The stage says what is wrong with one that may not be read.
+    if not path.is_file() or not os.access(path, os.R_OK):
         return "no file"
     about = path.stat()
-    if about.st_size > MAX_READ_BYTES:
-        return f"{about.st_size} {about.st_mtime_ns}"
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    large = about.st_size > MAX_READ_BYTES
+    with open(path, "rb") as file:
+        # A JPEG's EXIF lies in its first 64 KB: exiftool -P corrects heights in it, and keeps size and date.
+        content = hashlib.sha256(file.read(2**16 if large else -1)).hexdigest()
+    return f"{about.st_size} {about.st_mtime_ns} {content}" if large else content
 
 
 @functools.cache

@@ -120,6 +120,11 @@ def test_a_file_replaced_by_an_older_one_is_noticed(photo):
     assert photo(b"n" * large, 2000) != photo(b"o" * large, 1000)
 
 
+def test_a_height_that_is_corrected_in_a_large_photo_without_another_size_or_date_is_noticed(photo):
+    rest = b"o" * 2_000_000
+    assert photo(b"EXIF 512.3 m" + rest, 1000) != photo(b"EXIF 498.1 m" + rest, 1000)
+
+
 def test_a_small_file_that_is_only_touched_stays_the_same(photo):
     assert photo(b"same", 1000) == photo(b"same", 2000)
 
