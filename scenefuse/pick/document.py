@@ -76,7 +76,7 @@ def point_name(text: str) -> str:
         StageError: it is empty, or cannot stand in a table.
     """
     name = text.strip()
-    if not name or not name.isprintable() or name.startswith("#"):
+    if not name or not name.isprintable() or is_comment(name):
         raise StageError("a name consists of printable characters and does not begin with #; write another one")
     return name
 

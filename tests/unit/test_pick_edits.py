@@ -45,7 +45,7 @@ def test_a_point_clicked_again_in_its_photo_moves():
     assert rows == (Click("hat", "a.jpg", 5, 6), Click("boot", "a.jpg", 9, 9))
 
 
-@pytest.mark.parametrize("name", ["", "  ", "a\tb", "#1"])
+@pytest.mark.parametrize("name", ["", "  ", "a\tb", "#1", '"#1'])
 def test_a_name_that_a_table_cannot_hold_is_refused(name):
     with pytest.raises(StageError, match="printable characters"):
         point_name(name)
