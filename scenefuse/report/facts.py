@@ -23,7 +23,7 @@ from scenefuse.core.version import VERSION
 from scenefuse.photos.geodesy import given_place, heights_of
 from scenefuse.photos.photo_files import open_picture
 from scenefuse.photos.workspace import posed_images, read_model
-from scenefuse.report.run_summary import ALONE, ObjectSummary
+from scenefuse.report.run_summary import ALONE, ObjectSummary, is_added
 from scenefuse.report.values import WORDS, find, length, percent, percents, read_table, records
 
 Row = Mapping[str, Any]
@@ -151,9 +151,14 @@ def is_current(made: Path, source: Path) -> bool:
     return made.is_file() and source.is_file() and made.stat().st_mtime >= source.stat().st_mtime
 
 
+def has_surface(folder: Path) -> bool:
+    """Whether the surface of an object's last fusion is there; that of one that was refused shows the scene alone."""
+    return is_added(folder) and is_current(folder / "surface.json", folder / "fused.ply")
+
+
 def surface_facts(folder: Path, row: Row) -> dict[str, str]:
     """The same of the surface in an object's results; nothing where none was made of its last fusion."""
-    if not is_current(folder / "surface.json", folder / "fused.ply"):
+    if not has_surface(folder):
         return {}
     found = read_json(folder / "surface.json")
     if value(found, "status") == "empty":

@@ -14,7 +14,7 @@ from scenefuse.cloud.tiled_cloud import morton
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.photos.sheets import TILE_PX
-from scenefuse.report.facts import is_current
+from scenefuse.report.facts import has_surface
 from scenefuse.report.view import Bytes, color_planes, difference_planes, log_levels
 from scenefuse.surface.gltf import metres_per_unit, read_painted
 from scenefuse.surface.make_surface import read_surface
@@ -48,7 +48,7 @@ def read_mesh(folder: Path, unit: str) -> ViewMesh | None:
         folder: results of the object.
         unit: of the scene's lengths.
     """
-    whole = read_surface(folder / "surface.ply") if is_current(folder / "surface.json", folder / "fused.ply") else None
+    whole = read_surface(folder / "surface.ply") if has_surface(folder) else None
     if whole is None or not len(whole.faces):
         return None
     painted = read_painted(folder / "surface.glb")

@@ -772,6 +772,10 @@ def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_int
     assert f"; {value(surface_report(closed, 'm'), 'bridged_area'):#.3g} m² of it are interpolated" in found
     write_json(tmp_path / "surface.json", surface_report(closed, "m") | {"bridged_area": quantity(153.2, "m2")})
     assert "; 153 m² of it are interpolated" in surface_facts(tmp_path, {})["Mesh"]
+    # A run makes what was exported before again, also of an object that it refuses now.
+    write_json(tmp_path / "fusion.json", {"status": quantity("unregistered", "")})
+    assert surface_facts(tmp_path, {}) == {}
+    (tmp_path / "fusion.json").unlink()
     # Without a scale, glTF's metres are none.
     assert "surface.glb (the same, scene units, y up;" in surface_facts(tmp_path, {"unit": "scene units"})["Mesh"]
     pdf, made = tmp_path / "drawings/drawings.pdf", (tmp_path / "surface.json").stat().st_mtime
