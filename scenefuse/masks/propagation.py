@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks
 from scenefuse.masks.grabcut import cleaned
@@ -31,7 +30,7 @@ from scenefuse.masks.votes import (
     Voter,
     agrees_with_others,
     known_pixels,
-    known_points,
+    settled_points,
     vote_shares,
     voter_of,
 )
@@ -306,10 +305,7 @@ def _propagated(photos: Workspace, made: dict[int, Voter], left_out: list[str], 
             reasons[view.name] = (
                 f"the mask's agreement with its prompts is {made[k].agreement:.2f}, at least {MIN_AGREEMENT} is needed"
             )
-    rows = [voter.rows for voter in made.values() if voter.can_vote]
-    kind = known_points(photos, made)
-    counts = np.bincount(np.concatenate(rows), minlength=len(kind))
-    kind[counts < min(CONFIRMING_PHOTOS, len(rows))] = 0
+    kind = settled_points(photos, made)
     clicked = {k: voter.clicks for k, voter in made.items() if voter.clicks is not NO_CLICKS}
     quality = {photos.views[k].name: voter.quality for k, voter in sorted(made.items())}
     return Propagated(masks, reasons, kind, left_out, clicked, quality, notes)

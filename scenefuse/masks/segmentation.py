@@ -20,7 +20,7 @@ from scenefuse.masks.prompts import BOX_GROWTH_SHARE, Measure, Segmenter, agreem
 from scenefuse.masks.propagation import NO_CLICKS, propagate
 from scenefuse.masks.sam2 import SIDE_PX, Sam2, query_sam2, segment, segment_like
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
-from scenefuse.masks.votes import MIN_AGREEMENT, MIN_KNOWN_POINTS, points_held
+from scenefuse.masks.votes import MIN_AGREEMENT, MIN_KNOWN_POINTS, points_held, settled_points, voter_of
 from scenefuse.mvs.stereo_points import with_stereo_points
 from scenefuse.photos.photo_files import MIN_OBJECT_PHOTOS
 from scenefuse.photos.workspace import View, Workspace, read_model
@@ -110,8 +110,8 @@ def segment_again(
     with the hull, or much more than most, unless clicks alone suffice for it; again with the hull of the masks that
     this changed, and then all at the photo's resolution.
 
-    A mask that holds points of something else, by the `votes` (P,) of the first masks, as of a tree before a wall, is
-    not taken.
+    A mask that holds points of something else, as of a tree before a wall, by the `votes` (P,) of the first masks, is
+    not taken; before these go the votes of the masks that agree with the hull.
     """
     masks = list(masks)
     certain = tuple(photos.views[k].name for k, clicks in clicked.items() if clicks.enough)
@@ -120,14 +120,18 @@ def segment_again(
         outlines = [silhouette(hull, view) for view in photos.views]
         agreement = [mask_iou(mask, outline) for mask, outline in zip(masks, outlines)]
         least = max(settings.min_agreement, MIN_SHARE_OF_MEDIAN * float(np.median(agreement)))
+        agreeing = [k for k, share in enumerate(agreement) if share >= least]
+        voters = {k: voter_of(photos, k, masks[k], 1.0, 1.0, clicked.get(k, NO_CLICKS)) for k in agreeing}
+        own = settled_points(photos, voters)
+        kind = own if votes is None else np.where(own != 0, own, votes)
         changed = False
         for k, (view, outline) in enumerate(zip(photos.views, outlines)):
             final = masks[k].any() and view.name in certain
             if outline.any() and agreement[k] < least and not final:
                 again = segment_like(network, target, view, outline, clicked.get(k, NO_CLICKS))
-                held = np.zeros(0) if votes is None else votes[points_held(photos, k, again)]
+                held = kind[points_held(photos, k, again)]
                 foreign = np.count_nonzero(held) >= MIN_KNOWN_POINTS and np.mean(held[held != 0] > 0) < MIN_AGREEMENT
-                if mask_iou(again, outline) > agreement[k] and not foreign:
+                if mask_iou(again, outline) > agreement[k] and (votes is None or not foreign):
                     masks[k], changed = again, True
                 print(f"{view.name} segmented again, IoU {mask_iou(masks[k], outline):.2f}", flush=True)
         if not changed:

@@ -147,6 +147,14 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> NDArray[np.int8]:
     return known
 
 
+def settled_points(photos: Workspace, made: dict[int, Voter]) -> NDArray[np.int8]:
+    """The same of points on which three photos vote, where so many do; 0 for all others."""
+    kind, rows = known_points(photos, made), [voter.rows for voter in made.values() if voter.can_vote]
+    counts = np.bincount(np.concatenate([np.zeros(0, np.int64), *rows]), minlength=len(kind))
+    kind[counts < min(CONFIRMING_PHOTOS, len(rows))] = 0
+    return kind
+
+
 def known_pixels(photos: Workspace, k: int, others: dict[int, Voter]) -> Prompts:
     """What the others say of a photo's points: by their votes, and by their clicks outside, each of which is a click in
     this photo, too, at the nearest of its points that this photo sees."""

@@ -466,11 +466,22 @@ def test_clicks_and_box_prompt_their_own_photo_again_with_sam2(photos):
 
 
 def test_a_mask_made_again_is_not_taken_where_it_holds_what_other_masks_leave_out(photos):
-    masks = [true_mask(view) for view in photos.views]
-    masks[8] = np.zeros_like(masks[8])
-    for vote, taken in ((1, True), (-1, False), (0, True)):
+    """What the masks that agree see now goes before the first masks' votes, which stand where those see nothing."""
+    lower = np.arange(HEIGHT)[:, None] > HEIGHT / 2
+    blind = replace(
+        photos,
+        seen=[rows if k == 8 else rows[:0] for k, rows in enumerate(photos.seen)],
+        seen_at=[at if k == 8 else at[:0] for k, at in enumerate(photos.seen_at)],
+    )
+    for vote, others, seen, taken in (
+        (-1, True, photos, True),
+        (1, lower, photos, False),
+        (-1, True, blind, False),
+        (1, True, blind, True),
+    ):
         votes = np.full(len(photos.points), vote, np.int8)
-        again = segment_again(BallNetwork(photos), of_points(photos), masks, photos, COARSE, votes=votes)
+        masks = [true_mask(view) & (others if k != 8 else False) for k, view in enumerate(photos.views)]
+        again = segment_again(BallNetwork(photos), of_points(photos), masks, seen, COARSE, votes=votes)
         assert again[8].any() == taken
 
 
