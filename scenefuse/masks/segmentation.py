@@ -120,10 +120,12 @@ def segment_again(
         outlines = [silhouette(hull, view) for view in photos.views]
         agreement = [mask_iou(mask, outline) for mask, outline in zip(masks, outlines)]
         least = max(settings.min_agreement, MIN_SHARE_OF_MEDIAN * float(np.median(agreement)))
-        agreeing = [k for k, share in enumerate(agreement) if share >= least]
-        voters = {k: voter_of(photos, k, masks[k], 1.0, 1.0, clicked.get(k, NO_CLICKS)) for k in agreeing}
-        own = settled_points(photos, voters)
-        kind = own if votes is None else np.where(own != 0, own, votes)
+        kind = np.zeros(len(photos.points), np.int8)
+        if votes is not None:
+            agreeing = [k for k, share in enumerate(agreement) if share >= least]
+            voters = {k: voter_of(photos, k, masks[k], 1.0, 1.0, clicked.get(k, NO_CLICKS)) for k in agreeing}
+            own = settled_points(photos, voters)
+            kind = np.where(own != 0, own, votes)
         changed = False
         for k, (view, outline) in enumerate(zip(photos.views, outlines)):
             final = masks[k].any() and view.name in certain
@@ -131,7 +133,7 @@ def segment_again(
                 again = segment_like(network, target, view, outline, clicked.get(k, NO_CLICKS))
                 held = kind[points_held(photos, k, again)]
                 foreign = np.count_nonzero(held) >= MIN_KNOWN_POINTS and np.mean(held[held != 0] > 0) < MIN_AGREEMENT
-                if mask_iou(again, outline) > agreement[k] and (votes is None or not foreign):
+                if mask_iou(again, outline) > agreement[k] and not foreign:
                     masks[k], changed = again, True
                 print(f"{view.name} segmented again, IoU {mask_iou(masks[k], outline):.2f}", flush=True)
         if not changed:

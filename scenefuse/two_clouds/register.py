@@ -244,10 +244,9 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     part, searched = cut_scene(near, settings.crop, up_scene, known.fiducials, box is not None, whole.summary.count)
     part, strays = without_strays(part, f"what is searched of {scene}")
     notes += strays
-    for each, path in ((own, object), (part, scene)):
-        if fault := normals_fault(each):
-            notes.append(f"the normals of {path} {fault}: they are estimated from the points")
-    own = replace(own, normals=None) if normals_fault(own) else own
+    faults = [(object, normals_fault(own)), (scene, normals_fault(part))]
+    notes += [f"the normals of {path} {fault}: they are estimated from the points" for path, fault in faults if fault]
+    own = replace(own, normals=None) if faults[0][1] else own
     ups = None if up_object is None or up_scene is None else (up_object, up_scene)
     return Given(own, replace(whole, part=part), searched, notes, ups)
 
