@@ -194,10 +194,12 @@ def draw_surface(
             if side != "above":
                 if side == "facade":
                     shift[2] = -axes[2] @ np.array(facade[:3])
-                # Of an inclined plane, up are no heights.
-                if frame is not None and axes[1] @ UP > 1 - MARGIN:
-                    middle = whole.vertices.points.mean(0, keepdims=True)
-                    shift[1] = frame.in_crs(middle)[0, 2] / per_unit - middle[0, 2]
+                # Of an inclined plane, up are no heights; of one that leans a little they are, where it was clicked.
+                if axes[1] @ UP > 1 - MARGIN:
+                    clicked = np.reshape(facade, (3, 3)) if side == "facade" else whole.vertices.points
+                    middle = clicked.mean(0)
+                    height = middle[2] if frame is None else frame.in_crs(middle[None])[0, 2] / per_unit
+                    shift[1] = height - axes[1] @ middle
             elif frame is not None:
                 crs, shift, ratio = frame.crs, np.floor(frame.in_crs(np.zeros((1, 3)))[0]), per_unit
                 counted = frame.crs_unit if isinstance(frame, LocalFrame) else unit

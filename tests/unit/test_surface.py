@@ -457,6 +457,24 @@ def test_a_facade_is_drawn_of_the_plane_through_three_points_from_outside(coarse
         facade_axes(coarse, np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
 
 
+@pytest.mark.slow
+def test_a_facade_that_leans_far_from_the_scene_s_origin_has_the_heights_of_its_place(coarse, tmp_path: Path):
+    aside = np.array([200.0, 0, 0])
+    ball = replace(coarse, vertices=replace(coarse.vertices, points=coarse.vertices.points + aside))
+    lean = Rotation.from_euler("y", 5, degrees=True).apply(
+        np.array([[0.5, 0.3, -0.3], [0.5, -0.3, -0.3], [0.5, 0, 0.3]])
+    )
+    write_json(tmp_path / "g.json", GEOREFERENCE)
+    options = {"facade": tuple((lean + aside).ravel())}
+    for height, known in ((300, {"georeference_json": tmp_path / "g.json"}), (0, {})):
+        (folder := tmp_path / str(height)).mkdir()
+        drawings = ball_drawn(ball, folder, **options, **known)
+        for side in ("south", "facade"):
+            band = rasterio.open(drawings / f"{side}_class.tif")
+            rows = np.nonzero((band.read(1) != NOTHING).any(1))[0]
+            assert band.bounds.top - (rows.mean() + 0.5) * band.res[1] == pytest.approx(height, abs=0.05)
+
+
 def test_a_bridge_is_not_drawn_in_the_colours_of_what_lies_behind_it(closed):
     below = closed.part(closed.vertices.points[closed.faces][..., 2].max(1) < 0)
     red = np.full((8, 8, 3), (255, 0, 0), np.uint8)
