@@ -32,7 +32,7 @@ from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.sam2_weights import WEIGHTS, why_unavailable
 from scenefuse.masks.segmentation import MaskSettings, Prompted, ScoredMasks, masks_from_prompts, score_masks
 from scenefuse.masks.target import target_from_points
-from scenefuse.masks.votes import in_masks, points_in_masks
+from scenefuse.masks.votes import in_masks, points_in_masks, spread_less_than_surroundings
 from scenefuse.mvs.undistort import undistort_picture
 from scenefuse.photos.cameras.given import QUARTERS
 from scenefuse.photos.frames import original_sizes
@@ -222,13 +222,16 @@ def _supplied_as(inputs: MaskInputs, photos: Workspace, turned: dict[str, int]) 
     if inputs.supplied is None:
         raise StageError("method supplied needs a folder of masks; set its path in config/objects.tsv")
     found, unusable = supplied_masks(inputs.supplied, inputs.sparse, photos.views, turned)
-    require_white_object(found.values(), inputs.supplied)
     missing = {view.name: "no mask was supplied" for view in photos.views if view.name not in found}
     # Programs write a black mask of each photo in which nothing was drawn: it denies no point.
     missing |= {name: "empty mask" for name, mask in found.items() if not mask.any()}
     found = {name: mask for name, mask in found.items() if mask.any()}
     photos = photos.subset([k for k, view in enumerate(photos.views) if view.name in found])
-    return [found[view.name] for view in photos.views], photos, missing | unusable
+    masks = [found[view.name] for view in photos.views]
+    # An arch is white around a black middle, too.
+    if not spread_less_than_surroundings(photos, masks):
+        require_white_object(masks, inputs.supplied)
+    return masks, photos, missing | unusable
 
 
 def _kept(made: ScoredMasks, keep: str, inputs: MaskInputs, views: list[View]) -> ScoredMasks:

@@ -200,3 +200,13 @@ def in_masks(photos: Workspace, masks: list[Mask]) -> Array:
         np.add.at(seen, rows, 1)
         np.add.at(hit, rows, mask[v, u])
     return photos.points[(seen >= 2) & (hit > MIN_AGREEMENT * seen)]
+
+
+def spread_less_than_surroundings(photos: Workspace, masks: list[Mask]) -> bool:
+    """Whether the sparse points in masks (H, W) lie nearer together than those off them, where there are both: an
+    object's do, as its surroundings reach farther on all sides."""
+    own, others = in_masks(photos, masks), in_masks(photos, [~mask for mask in masks])
+    if min(len(own), len(others)) < MIN_OWN_POINTS:
+        return False
+    near, far = (np.median(np.linalg.norm(side - np.median(side, axis=0), axis=1)) for side in (own, others))
+    return bool(near < far)

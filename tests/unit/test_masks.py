@@ -14,6 +14,7 @@ import pycolmap
 import pytest
 
 from scenefuse.core.stage import StageError, read_json, sha256, value, write_json
+from scenefuse.core.transforms import UP, look_at
 from scenefuse.geometry.visual_hull import carve, mask_iou, silhouette
 from scenefuse.marks.clicks import read_points
 from scenefuse.marks.photo_clicks import PhotoClicks
@@ -73,6 +74,28 @@ def look(pose):
     return ball, position + rays * distance[..., None]
 
 
+def write_capture(folder, views, points, shown):
+    """COLMAP model of photos that show these rows of points (N, 3), and the other files that the stage reads."""
+    model = pycolmap.Reconstruction()
+    params = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=params, camera_id=1)
+    )
+    tracks = [[] for _ in points]
+    for k, (one, rows) in enumerate(zip(views, shown)):
+        pixels = [pycolmap.Point2D(pixel) for pixel in one.project(points[rows])[0]]
+        image = pycolmap.Image(name=f"f{k}.png", camera_id=1, image_id=k + 1, points2D=pixels)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(one.cam_from_world[:3]))
+        for j, row in enumerate(rows):
+            tracks[row].append(pycolmap.TrackElement(k + 1, j))
+    for point, track in zip(points, tracks):
+        if len(track) > 1:
+            model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
+    model.write_binary(folder / "undistorted" / "sparse")
+    write_json(folder / "photos.json", {"photos": []})
+    write_json(folder / "undistorted.json", {"up_in_camera_frame": {"value": [0, 0, 1], "unit": "1"}})
+
+
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     folder = tmp_path_factory.mktemp("capture")
@@ -84,12 +107,7 @@ def capture(tmp_path_factory):
     sphere = CENTRE + RADIUS * sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
     ground = np.column_stack([generator.uniform(-3.5, 3.5, (250, 2)), np.zeros(250)])
     points = np.concatenate([sphere, ground])
-    model = pycolmap.Reconstruction()
-    params = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=params, camera_id=1)
-    )
-    tracks = [[] for _ in points]
+    shown = []
     for k in range(PHOTOS):
         pose = camera_pose(k)
         ball, seen = look(pose)
@@ -97,23 +115,9 @@ def capture(tmp_path_factory):
         photo = np.where(ball[..., None], [50, 60, 170], [60, 130, 70]) + noise
         cv2.imwrite(str(folder / "undistorted" / "images" / f"f{k}.png"), np.clip(photo, 0, 255).astype(np.uint8))
         cv2.imwrite(str(folder / "truth" / f"f{k}_mask.png"), ball.astype(np.uint8) * 255)
-        x = points @ pose[:3, :3].T + pose[:3, 3]
-        pixels = FOCAL * x[:, :2] / x[:, 2:] + [WIDTH / 2, HEIGHT / 2]
-        inside = np.flatnonzero(((pixels > 1) & (pixels < [WIDTH - 1, HEIGHT - 1])).all(1))
-        u, v = pixels[inside].astype(int).T
-        rows = inside[np.linalg.norm(seen[v, u] - points[inside], axis=1) < 0.15]
-        image = pycolmap.Image(
-            name=f"f{k}.png", camera_id=1, image_id=k + 1, points2D=[pycolmap.Point2D(p) for p in pixels[rows]]
-        )
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
-        for j, row in enumerate(rows):
-            tracks[row].append(pycolmap.TrackElement(k + 1, j))
-    for point, track in zip(points, tracks):
-        if len(track) > 1:
-            model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
-    model.write_binary(folder / "undistorted" / "sparse")
-    write_json(folder / "photos.json", {"photos": []})
-    write_json(folder / "undistorted.json", {"up_in_camera_frame": {"value": [0, 0, 1], "unit": "1"}})
+        rows, at, _ = view(k).visible(points)
+        shown.append(rows[np.linalg.norm(seen[at[:, 1], at[:, 0]] - points[rows], axis=1) < 0.15])
+    write_capture(folder, [view(k) for k in range(PHOTOS)], points, shown)
     marks = [(0, 0, 2), (1, 0, 1), (-1, 0, 1), (0, 1, 1), (0, -1, 1), (0, 0, 0.05)]
     lines = [f"p{i}\t{x}\t{y}\t{z}" for i, (x, y, z) in enumerate(marks)]
     (folder / "prompts.tsv").write_text("\n".join(["point\tx\ty\tz", *lines]) + "\n")
@@ -204,6 +208,34 @@ def test_masks_that_are_black_on_the_object_are_an_error(capture, tmp_path, foot
         cv2.imwrite(str(file), 255 - mask)
     with pytest.raises(StageError, match="are black on the object; invert them"):
         run_stage(capture, tmp_path, method="supplied", prompts=None, supplied=supplied)
+
+
+def test_masks_of_an_arch_are_white_around_a_black_middle_and_right_all_the_same(tmp_path):
+    """A gate of 6 x 5 metres, its opening 3 x 3.5, photographed from near, so that a wall shows through it."""
+    for name in ("undistorted/images", "undistorted/sparse", "truth"):
+        (tmp_path / name).mkdir(parents=True)
+    generator = np.random.default_rng(0)
+    gate = generator.uniform([-3, -0.3, 0], [3, -0.3, 5], (3000, 3))
+    gate = gate[(np.abs(gate[:, 0]) > 1.5) | (gate[:, 2] > 3.5)]
+    wall = generator.uniform([-20, 12, 0], [20, 12, 9], (1500, 3))
+    points, views, shown = np.concatenate([gate, wall]), [], []
+    for k, x in enumerate(np.linspace(-1.5, 1.5, PHOTOS)):
+        one = dataclasses.replace(view(0), name=f"f{k}.png", cam_from_world=np.eye(4))
+        one.cam_from_world[:3, :3] = look_at(np.array([x, -4.2, 1.7]), np.array([0, 0, 2.4]), UP)
+        one.cam_from_world[:3, 3] = -one.cam_from_world[:3, :3] @ [x, -4.2, 1.7]
+        pixels = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5, [1.0]), -1)[:, :, 0]
+        rays = pixels @ np.linalg.inv(one.intrinsics).T @ one.cam_from_world[:3, :3]
+        at = one.centre + rays * ((-0.3 - one.centre[1]) / rays[..., 1])[..., None]
+        mask = (np.abs(at[..., 0]) < 3) & (at[..., 2] > 0) & (at[..., 2] < 5)
+        mask &= (np.abs(at[..., 0]) > 1.5) | (at[..., 2] > 3.5)
+        rows, found, _ = one.visible(points)
+        views.append(one)
+        shown.append(rows[mask[found[:, 1], found[:, 0]] == (rows < len(gate))])
+        cv2.imwrite(str(tmp_path / f"truth/f{k}.png"), mask.astype(np.uint8) * 255)
+        cv2.imwrite(str(tmp_path / f"undistorted/images/f{k}.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    write_capture(tmp_path, views, points, shown)
+    run_stage(tmp_path, tmp_path, method="supplied", prompts=None, supplied=tmp_path / "truth")
+    assert value(read_json(tmp_path / "masks.json"), "median_agreement") > 0.9
 
 
 def test_black_masks_of_photos_in_which_nothing_was_drawn_deny_nothing(capture, tmp_path):
