@@ -210,7 +210,6 @@ def test_where_colours_cannot_be_told_from_other_columns_there_are_none(tmp_path
         ("N [m] E [m] H [m]", "{y} {x} {z}"),
         ("Northing,Easting,Elevation\nm,m,m", "{y},{x},{z}"),
         ("Northing (m)\tEasting (m)\tElevation (m)\tPoint Code", "{y}\t{x}\t{z}\ttree top"),
-        ("Y coord\tX coord\tZ coord", "{y}\t{x}\t{z}"),
         ("Norte;Este;Cota", "{y};{x};{z}"),
         ("Est;Nord;Quota", "{x};{y};{z}"),
     ],
@@ -237,6 +236,9 @@ def test_names_in_another_order_that_do_not_fit_the_rows_are_refused(tmp_path):
             "column Y-Koordinate is the easting or",
         ),
         (b"X Koordinate\tY Koordinate\tZ\n" + b"1.5\t2\t3\n" * 4, "column X Koordinate is the easting or"),
+        (b"Nr;Y;X;H\n" + b"1;431000.5;5400000.5;2\n" * 4, "column X is the easting or"),
+        (b"Y coord\tX coord\tZ coord\n" + b"1.5\t2\t3\n" * 4, "column X coord is the easting or"),
+        (b"Punto;Norte;Este;Cota ortom\n" + b"1;5400000.5;431000.5;2\n" * 4, "does not say which three columns"),
         (b"ncols 4\nnrows 2\nxllcorner 1\nyllcorner 2\ncellsize 1\n1 2 3 4\n5 6 7 8\n", "is a raster of heights"),
         (b"DSAA\r\n4 2\r\n0 3\r\n0 1\r\n1 8\r\n1 2 3 4\r\n5 6 7 8\r\n", "is a raster of heights"),
         (b"1\n1\n" + b"0 0 0\n" * 4 + b"1 0 0 0\n" * 4 + b"1 2 3 0.5\n", "is PTX, whose scans have poses"),
@@ -373,7 +375,7 @@ def test_rows_of_other_lengths_are_an_error_and_lines_above_are_no_points(tmp_pa
     rows = "".join(f"P{k} {k}.5 2.5 3.5 9 9 9\n" for k in range(9))
     (tmp_path / "c.txt").write_text("Origin 500000 5000000 0\n" + rows)
     assert len(read_cloud(tmp_path / "c.txt")) == 9
-    (tmp_path / "d.csv").write_text('"","y","x","z"\n' + "".join(f'"{k}",2,1,{k}.5\n' for k in range(1, 6)))
+    (tmp_path / "d.csv").write_text('"","x","z","y"\n' + "".join(f'"{k}",1,{k}.5,2\n' for k in range(1, 6)))
     assert read_cloud(tmp_path / "d.csv").points[0].tolist() == [1, 2, 1.5]
 
 

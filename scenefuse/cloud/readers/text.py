@@ -112,6 +112,8 @@ def text_layout(path: Path) -> TextLayout:
     names = next((names for names in fitting if _axes(names)), [])
     if axes := _axes(names):
         usual = common_names(names)
+        if axes[1] + 1 == axes[0] < axes[2] and names[axes[0]].lower().startswith("x"):
+            raise _unsure(path, names[axes[0]])
         if len(units := {unit[1].lower() for k in axes if (unit := UNIT.search(names[k]))}) > 1:
             raise StageError(f"{path} has x, y and z in {', '.join(sorted(units))}; export all three in one unit")
         if not set(POSITION) <= set(usual):
@@ -127,10 +129,12 @@ def text_layout(path: Path) -> TextLayout:
         for name in filter(DEGREES.match, called):
             raise StageError(f"{path} is in degrees (column {name}); project it to metres first, to UTM for instance")
         for name in filter(EAST_OR_NORTH.match, called):
-            raise StageError(
-                f"{path}: whether column {name} is the easting or the northing cannot be told; name the columns"
-                " Rechtswert and Hochwert"
-            )
+            raise _unsure(path, name)
+        for line in fitting:
+            # A northing that stands first is no x, whatever the others are.
+            if any(k != first + axis for axis, found in enumerate(_surveyed(line)) for k in found):
+                said = "does not say which three columns are x, y and z; call them so"
+                raise StageError(f"{path}: '{' '.join(line)[:60]}' {said}")
         if first == 1 and width > rows.shape[1] == 4:
             raise StageError(
                 f"{path}: whether its rows are point, easting, northing or point, northing, easting cannot be told;"
@@ -227,10 +231,23 @@ def _axes(names: list[str]) -> list[int]:
     usual = common_names(names)
     if set(POSITION) <= set(usual):
         return [usual.index(axis) for axis in POSITION]
+    found = _surveyed(names)
+    return [k for (k,) in found] if all(len(some) == 1 for some in found) else []
+
+
+def _surveyed(names: list[str]) -> list[list[int]]:
+    """Which columns may be x, which y, and which z by the names of surveyors."""
     words = [re.split(r"[\s_.-]+", re.sub(r"[\[(].*", "", name.lower())) for name in names]
     plain = ["".join(word for word in some if word not in BESIDE) for some in words]
-    found = [[k for k, name in enumerate(plain) if name in own] for own in (EASTING, NORTHING, ELEVATION)]
-    return [k for (k,) in found] if all(len(some) == 1 for some in found) else []
+    return [[k for k, name in enumerate(plain) if name in own] for own in (EASTING, NORTHING, ELEVATION)]
+
+
+def _unsure(path: Path, name: str) -> StageError:
+    """The error of a column of that name: y before x is the easting where surveyors count x to the north."""
+    return StageError(
+        f"{path}: whether column {name} is the easting or the northing cannot be told; name the columns Easting and"
+        " Northing"
+    )
 
 
 def _check_order(path: Path, headers: list[list[str]], columns: int) -> None:
