@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, conv2d, max_pool2d
+from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, pad
 
 from scenefuse.core.transforms import DEPTH_JUMP
 from scenefuse.nerf.field import Field
@@ -243,9 +243,9 @@ def measured_sharpness(images: Tensor, masks: Tensor) -> Tensor:
 
 
 def blurred(planes: Tensor, sigma: float) -> Tensor:
-    """Planes (C, H, W) under a Gaussian of sigma pixels, cut off at three sigma, with zeros around them."""
+    """Planes (C, H, W) under a Gaussian of sigma pixels, cut off at three sigma; beyond them their border goes on."""
     reach = int(3 * sigma + 0.5)
     line = torch.exp(-((torch.arange(-reach, reach + 1) / sigma) ** 2) / 2)
     line = (line / line.sum()).view(1, 1, 1, -1)
-    rows = conv2d(planes[:, None], line, padding=(0, reach))
-    return conv2d(rows, line.transpose(2, 3), padding=(reach, 0))[:, 0]
+    rows = conv2d(pad(planes[:, None], (reach,) * 4, "replicate"), line)
+    return conv2d(rows, line.transpose(2, 3))[:, 0]
