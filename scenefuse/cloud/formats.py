@@ -104,7 +104,7 @@ def readable(path: Path) -> Iterator[None]:
         if path.is_file() and path.stat().st_size == 0:
             raise StageError(f"{path} is empty (0 bytes); copy or export it again")
         yield
-    except MemoryError:
+    except (MemoryError, ImportError):
         raise
     except Exception as error:  # each library has its own errors for a damaged file
         said = str(error)

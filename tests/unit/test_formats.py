@@ -1,5 +1,7 @@
 """Cloud files of other programs: what was written comes back, in float64, or one sentence says why not."""
 
+import sys
+
 import laspy
 import numpy as np
 import open3d as o3d
@@ -55,6 +57,13 @@ def test_compressed_pcd_reads_as_its_writer_reads_it(tmp_path):
     assert (tmp_path / "a.pcd").stat().st_size < 8 * len(grid)
     assert np.array_equal(found.points, np.asarray(read.points))
     assert np.array_equal(found.colors, np.rint(np.asarray(read.colors) * 255))
+
+
+def test_a_library_that_is_not_installed_is_no_fault_of_the_file(tmp_path, monkeypatch, cloud):
+    write_e57(tmp_path / "a.e57", [(cloud.points, cloud.colors, None, None)])
+    monkeypatch.setitem(sys.modules, "pye57", None)
+    with pytest.raises(ModuleNotFoundError, match="pye57"):
+        read_cloud(tmp_path / "a.e57")
 
 
 def test_e57_scans_are_moved_by_their_poses_and_joined(tmp_path, cloud):
