@@ -214,7 +214,7 @@ def draw_surface(
             towards += "" if has_north else ", y taken for north"
             if abs(axes[2] @ UP) > 1 - MARGIN:
                 towards = f", looking {'down' if axes[2] @ UP > 0 else 'up'}"
-            scale = _scale(drawing, metres / ratio)
+            scale = _scale(drawing, metres / ratio, unit)
             where = {"above": "plan", "facade": "facade"}.get(side, f"elevation from the {side}")
             title = f"{name}, {where}{'' if side == 'above' else towards}"
             title += f"; 1:{scale} on A3" if unit != "scene units" else ""
@@ -274,11 +274,13 @@ def _write_bands(path: Path, drawing: Drawing, crs: str | None, shift: Array) ->
                 file.colorinterp = COLORS
 
 
-def _scale(drawing: Drawing, metres: float) -> int:
-    """N of the largest scale 1:N, N = 1, 2 or 5 times a power of ten, at which a drawing fits on the page."""
+def _scale(drawing: Drawing, metres: float, unit: str) -> float:
+    """N of the largest scale 1:N, N = 1, 2 or 5 times a power of ten, at which a drawing fits on the page; of "scene
+    units" less than 1 too."""
     height, width = drawing.classes.shape
     needed = metres * drawing.pixel * max(width / DRAWN[0], height / DRAWN[1])
-    return max(1, round(1 / round_below(1 / needed)))
+    scale = 1 / round_below(1 / needed)
+    return scale if unit == "scene units" else max(1, round(scale))
 
 
 def _sheet(

@@ -397,6 +397,15 @@ def test_an_elevation_has_the_scale_that_it_says(drawings):
 
 
 @pytest.mark.slow
+def test_a_sheet_of_an_object_of_a_thousandth_of_a_scene_unit_is_as_large_as_one_of_a_thousand(coarse, tmp_path: Path):
+    for size in (1e-3, 1e3):
+        (folder := tmp_path / str(size)).mkdir()
+        vertices = coarse.vertices.transformed(Sim3(size, np.eye(3), np.zeros(3)))
+        report = read_json(ball_drawn(replace(coarse, vertices=vertices), folder) / "drawings.json")
+        assert 2 * size / value(report, "south_scale") == pytest.approx(0.2)
+
+
+@pytest.mark.slow
 def test_a_drawing_names_its_day_and_a_plan_its_crs_with_an_arrow_to_the_north(drawings, placed):
     def said(folder):
         return [page.get_textpage().get_text_bounded() for page in pypdfium2.PdfDocument(folder / "drawings.pdf")]
