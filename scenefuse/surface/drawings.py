@@ -24,7 +24,7 @@ from scenefuse.fuse.compare import MARGIN
 from scenefuse.fuse.measure import SUPPORT
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
 from scenefuse.photos.sheets import round_below
-from scenefuse.surface.gltf import BRIDGED_TINT, Painted, metres_per_unit, read_painted
+from scenefuse.surface.gltf import BRIDGED_TINT, NO_COLOR, Painted, metres_per_unit, read_painted
 from scenefuse.surface.make_surface import read_surface
 from scenefuse.surface.mesh import AT_ONCE, FaceClass, Surface, cast, caster
 from scenefuse.surface.texture import MAX_SIDE_PX
@@ -99,7 +99,7 @@ def draw(surface: Surface, painted: Painted | None, axes: Array, pixel: float) -
         heights[at] = origins[on, 2] - hit["t_hit"][on]
         classes[at] = surface.classes[face]
         deviations[at] = (surface.vertices.fields["deviation"][corner] * weights).sum(1)
-        colors[at] = 160, 160, 160, 255
+        colors[at] = *NO_COLOR, 255
         if surface.vertices.colors is not None:
             colors[at, :3] = (surface.vertices.colors[corner] * weights[..., None]).sum(1)
         if painted is not None:

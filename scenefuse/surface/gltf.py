@@ -30,6 +30,8 @@ from scenefuse.surface.mesh import FaceClass, Surface
 Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 # What nobody measured is drawn in one colour (sRGB), which photos of objects hardly hold.
 BRIDGED_TINT = (203, 89, 188)
+# What has no colour.
+NO_COLOR = (160, 160, 160)
 
 
 class _Code(IntEnum):

@@ -20,6 +20,7 @@ from scenefuse.fuse.write import GAINS
 from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS, MIN_COSINE
 from scenefuse.photos.frames import sharpness
 from scenefuse.photos.workspace import View
+from scenefuse.surface.gltf import NO_COLOR
 from scenefuse.surface.mesh import AT_ONCE, FaceClass, Rows, Surface, cast, caster, normals_of
 
 # Faces that a textured surface is simplified to: what is finer is in its picture, and to unfold more takes minutes.
@@ -38,7 +39,7 @@ class Textured:
         surface: F faces.
         uv: (F, 3, 2) places of their corners in the picture, from its upper left, 0..1.
         picture: (H, W, 3) uint8.
-        shown_share: of the area that is to be painted, what photos show; the rest has the colours of the points.
+        shown_share: of the area that is to be painted, what photos show; the rest has those of the points, or grey.
     """
 
     surface: Surface
@@ -86,7 +87,9 @@ def textured(surface: Surface, photos: list[View], read: Callable[[int], NDArray
         weight[rows] += share
     shown = weight > 0
     color[shown] /= weight[shown, None]
-    if small.vertices.colors is not None and not shown.all():
+    if small.vertices.colors is None:
+        color[~shown] = NO_COLOR
+    elif not shown.all():
         own = cKDTree(points).query(places[~shown], workers=threads())[1]
         color[~shown] = small.vertices.colors[own]
     picture = np.zeros((side, side, 3), np.uint8)
