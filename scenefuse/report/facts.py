@@ -309,7 +309,7 @@ def closing_lines(summary: Path) -> str:
     ]
     # First what is not done, then what could be better.
     steps = [f"{row['object']}: {object_facts(row)['Result']}" for row in objects if row not in done]
-    found = {row["object"]: object_facts(row).get("Next", "") for row in done}
+    found = {row["object"]: object_facts(row).get("Next", "") for row in objects}
     steps += [f"{name}: {step}" for name, text in found.items() for step in text.splitlines()]
     first, *more = steps or ["open the result in CloudCompare or QGIS"]
     page = summary / "report.html"
@@ -417,6 +417,10 @@ def diagnose(item: ObjectSummary) -> list[str]:
         say("exposure", jumps, stops=MAX_EXPOSURE_STOPS)
     if known("alignment.found", True) is False:
         say("unlinked", reason=known("alignment.reason", ""))
+    # The variant that is fused comes first.
+    fused = next(iter(item.variants), "")
+    if item.status(fused) == "unregistered" and find(item.variants[fused], "crop.mode") == "none":
+        say("unmarked")
     return said
 
 

@@ -35,6 +35,15 @@ def test_nothing_is_said_where_all_is_well_or_nothing_has_run():
     assert diagnose(ObjectSummary("rock", {}, {}, {}, "", "", {})) == []
 
 
+def test_a_cloud_that_nothing_marks_and_that_is_refused_is_to_be_marked():
+    def said(mode, status):
+        fields = {"crop.mode": {"value": mode, "unit": ""}, "fine.status": {"value": status, "unit": ""}}
+        return " ".join(diagnose(ObjectSummary("rock", {}, {"full": fields}, {}, "", "", {})))
+
+    assert "column fiducials" in said("none", "unregistered")
+    assert not said("none", "registered") and not said("fiducials", "unregistered")
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
