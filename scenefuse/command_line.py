@@ -79,19 +79,25 @@ def _need_project(*elsewhere: str) -> None:
     """Exit with a sentence where the folder holds no project and no option begins with one of these words."""
     from scenefuse.core.settings import ROOT
 
-    if not (SCENES.is_file() or Path.cwd() == ROOT or any(word.startswith(elsewhere) for word in sys.argv[1:])):
-        where = f"there is no {SCENES} here ({Path.cwd()})"
+    folder = _given().directory.absolute()
+    if not ((folder / SCENES).is_file() or folder == ROOT or any(word.startswith(elsewhere) for word in sys.argv[1:])):
+        where = f"there is no {SCENES} here ({folder})"
         sys.exit(f"error: {where}; run this in a project of scenefuse complete or scenefuse init, or give --configfile")
+
+
+def _given() -> argparse.Namespace:
+    """The options of Snakemake that say where the project and its settings are."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--configfile", "--configfiles", nargs="+", type=Path, default=[])
+    parser.add_argument("--directory", "-d", type=Path, default=Path())
+    return parser.parse_known_args(sys.argv[1:])[0]
 
 
 def _settings_files() -> tuple[list[Path], list[str]]:
     """The settings files of the command line, or the project's; and the words that name the latter to Snakemake."""
     from scenefuse.core.settings import OWN_SETTINGS
 
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--configfile", "--configfiles", nargs="+", type=Path, default=[])
-    parser.add_argument("--directory", "-d", type=Path, default=Path())
-    words = parser.parse_known_args(sys.argv[1:])[0]
+    words = _given()
     given, file = words.configfile, words.directory / OWN_SETTINGS
     # Snakemake refuses a file without keys, as one is whose only line was commented out.
     has_own = file.is_file() and re.search(r"^[^#\s]", file.read_text(errors="replace"), re.MULTILINE)
@@ -136,8 +142,8 @@ def _run() -> None:
     if {"-h", "--help"} & set(sys.argv):
         print(inspect.getdoc(_run))
         return
-    # Options of Snakemake that say where the project is, or that none is needed.
-    _need_project("--config", "--directory", "-d", "--version")
+    # Options of Snakemake that say what the project is, or that none is needed.
+    _need_project("--config", "--version")
     files, own = _settings_files()
     own += [] if any(word.startswith(PARALLEL) for word in sys.argv[1:]) else ["--cores", "all"]
     try:

@@ -337,6 +337,13 @@ def test_run_in_another_folder_reads_the_settings_of_the_project_there(two_folde
     assert started(monkeypatch, *words) == [*words, *own, "--cores", "all"]
 
 
+def test_a_folder_that_is_misspelled_is_no_project_of_the_demo(two_folders, monkeypatch):
+    init(Path("yard"), scene=Path("flight"))
+    monkeypatch.chdir("yard")
+    with pytest.raises(SystemExit, match=r"there is no config/scenes.tsv here \(.*/yrad\)"):
+        started(monkeypatch, "--directory", "../yrad")
+
+
 def test_the_help_of_run_is_one_screen(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["scenefuse", "run", "--help"])
     command_line.main()
