@@ -30,7 +30,8 @@ LOG, SUMMARY = Path("results/logs/run.log"), Path("results/summary")
 # Lines of a run that people want to see, or that say why it failed.
 JOB, FORECAST_LINE = re.compile(r"Job \d+: (.+)"), re.compile("(time|memory|disk): .+")
 FAILED_LOG = re.compile(r"Logfile (results/logs/\S+/(\S+)\.log):")
-ERROR, FAILED, CLOSING = re.compile(r"\w*(Error|Exception)\b.*:"), ("failed: ", "error: "), "Result: "
+ERROR, CLOSING = re.compile(r"\w*(Error|Exception)\b.*:"), "Result: "
+FAILED = tuple(map(re.compile, ("failed: (.*)", "error: (.*)", "(another run works .*)")))
 Preset = Literal["draft", "normal", "high"]
 Folder = tyro.conf.Positional[Path]
 
@@ -255,13 +256,13 @@ def report_step(project: Path, line: str, started: float, cores: int) -> None:
 
 def _why(lines: Sequence[str]) -> str:
     """Why a run failed, from its log: the jobs that failed, else the first error."""
-    for start in FAILED:
-        said = [line.removeprefix(start) for line in lines if line.startswith(start)]
+    for pattern in FAILED:
+        said = [found[1] for line in lines if (found := pattern.fullmatch(line))]
         if said:
             return "; ".join(said)
-    found = next((at + 1 for at, line in enumerate(lines[:-1]) if ERROR.fullmatch(line)), None)
-    if found is None:
+    first = next((at + 1 for at, line in enumerate(lines[:-1]) if ERROR.fullmatch(line)), None)
+    if first is None:
         return "Snakemake ended early"
     # Indented lines say which files are meant.
-    below = takewhile(lambda line: line.startswith(" "), lines[found + 1 :])
-    return " ".join([lines[found], *map(str.strip, below)])
+    below = takewhile(lambda line: line.startswith(" "), lines[first + 1 :])
+    return " ".join([lines[first], *map(str.strip, below)])
