@@ -268,8 +268,8 @@ def test_a_folder_without_photos_of_its_own_is_one_sentence(two_folders):
         ),
         ("error: the disk is full", "^the disk is full"),
         (
-            "another run works in this folder; wait until it ends, or stop it\\nLockException:\\nError: Directory cannot be"
-            " locked, in the following directory:\\n/yard",
+            "another run works in this folder; wait until it ends, or stop it\\nLockException:\\nError: Directory"
+            " cannot be locked, in the following directory:\\n/yard",
             "^another run works in this folder; wait until it ends, or stop it;",
         ),
         ("", "^Snakemake ended early"),
