@@ -17,7 +17,6 @@ from scenefuse.core.transforms import Sim3
 from scenefuse.fuse.fuse_object import photos_of
 from scenefuse.fuse.measure import RESOLUTION, with_normals
 from scenefuse.fuse.missing import NEAR, Lack, Missing, Plan, find_missing_surface, plan_stations, reach_of_stations
-from scenefuse.fuse.modes import around
 from scenefuse.fuse.surroundings import missing_ground
 from scenefuse.fuse.write import added_by, read_changes, together
 from scenefuse.geometry.photo_check import Photos
@@ -94,7 +93,7 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     cameras = masks or photos[0].views
     views = photos[0].views + photos[1].views
     near, around_it = _surroundings(inputs, obj, views, reach_of_stations(obj, cameras) if cameras else 0.0)
-    missing = find_missing_surface(obj, near[around(near, obj)], photos, masks)
+    missing = find_missing_surface(obj, near, photos, masks)
     plan = plan_stations(missing, obj, around_it, cameras)
     write_cloud(outputs.missing, missing.cells)
     georeference = read_json(inputs.georeference_json)

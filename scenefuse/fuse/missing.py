@@ -20,6 +20,7 @@ from scenefuse.core.stage import threads
 from scenefuse.core.transforms import UP, Array, look_at
 from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, THROUGH_SHARE
 from scenefuse.fuse.measure import NEAR, RESOLUTION, Evidence
+from scenefuse.fuse.modes import around
 from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS, MIN_AGREEING, see, shown_in
 from scenefuse.geometry.photo_check import Photos, match_in
 from scenefuse.geometry.photo_kernel import GOOD_ANGLE
@@ -93,17 +94,21 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
 
     Args:
         obj: the object's whole cloud in the scene's frame, with normals.
-        completed: the completed scene around it, with normals and the field `evidence`.
+        completed: the completed scene within a diagonal of it, with normals and the field `evidence`.
         photos: the object's and the scene's, in the scene's frame.
         masks: the object's cameras in the scene's frame with masks (H, W) as pixels; none leaves the second out.
     """
     side = margin = RESOLUTION * obj.diagonal
     views = photos[0].views + photos[1].views
     surface = _plain(voxel_downsample(completed, side / 2))
+    near = around(surface, obj)
+    # What stands beside the object hides, too: past a niche, photos would see into the wall that it is in.
+    beside, surface = surface[~near], surface[near]
+    hides = beside, spacing(beside.points, quantile=SPARSEST)
     step = spacing(surface.points, quantile=SPARSEST)
     apart = ~within(obj.points, surface.points, SAME_PLACE_SPACINGS * side)
     loose = _plain(obj[apart])
-    through = see(loose.points, surface, views, step, margin).through >= MIN_AGREEING
+    through = see(loose.points, surface, views, step, margin, hides).through >= MIN_AGREEING
     through |= _off_masks(loose.points, masks)
     loose = loose[~through]
     if len(loose):
@@ -112,7 +117,7 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     supposed, edge = grid.hold(loose.points), grid.none()
     towards = np.zeros((*grid.shape, 3), np.float32)
     if masks:
-        edge, towards = _frontier(grid, surface, views, masks, step, margin)
+        edge, towards = _frontier(grid, surface, hides, views, masks, step, margin)
         edge = grid.within(obj.points, MAX_FROM_OBJECT * obj.diagonal, edge)
     found = _in_spots(supposed | edge)
     centres, normals = grid.middle(found), towards[found]
@@ -172,13 +177,19 @@ class _Cells:
 
 
 def _frontier(
-    grid: _Cells, surface: Cloud, views: list[View], masks: list[View], step: float, margin: float
+    grid: _Cells,
+    surface: Cloud,
+    hides: tuple[Cloud, float],
+    views: list[View],
+    masks: list[View],
+    step: float,
+    margin: float,
 ) -> tuple[Grid, NDArray[np.float32]]:
     """Cells of unknown space that border on empty space, and for every cell the direction towards empty space."""
     centres = grid.centres
     shown, off, *_ = count_silhouettes(centres, map(Outline, masks))
     in_hull = (shown >= CONFIRMING_PHOTOS) & (off <= MAX_WRONG_SHARE * shown)
-    seen = see(centres, surface, views, step, margin)
+    seen = see(centres, surface, views, step, margin, hides)
     # Off the masks nothing of the object is, where photos see the place at all; below the ground few do, through gaps.
     in_sight = seen.in_view - seen.hidden >= np.maximum(MIN_AGREEING, THROUGH_SHARE * seen.in_view)
     empty = (seen.through >= MIN_AGREEING) | (~in_hull & in_sight)

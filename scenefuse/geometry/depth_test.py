@@ -101,7 +101,14 @@ class Visibility:
     through: NDArray[np.int64]
 
 
-def see(points: Array, surface: Cloud, views: list[View], spacing: float, margin: float) -> Visibility:
+def see(
+    points: Array,
+    surface: Cloud,
+    views: list[View],
+    spacing: float,
+    margin: float,
+    beside: tuple[Cloud, float] | None = None,
+) -> Visibility:
     """Test points (N, 3) against the measured points of a surface, with normals, in each photo.
 
     Args:
@@ -110,11 +117,16 @@ def see(points: Array, surface: Cloud, views: list[View], spacing: float, margin
         views: cameras.
         spacing: of the surface's points.
         margin: how far before or behind the surface a point must lie to count, unit of the frame.
+        beside: what else hides points, with normals, and its spacing; nothing is seen through to it.
     """
     in_view, hidden, through = (np.zeros(len(points), dtype=np.int64) for _ in range(3))
     for view in views if len(surface) > 1 else ():
         nearest, farthest = _surface_in(surface, view, spacing)
         found = depth_test(points, nearest, margin, farthest)
+        if beside is not None:
+            rows = np.flatnonzero((found != Where.OUTSIDE) & (found != Where.BEHIND))
+            nearest, farthest = _surface_in(beside[0], view, beside[1])
+            found[rows[depth_test(points[rows], nearest, margin, farthest) == Where.BEHIND]] = Where.BEHIND
         in_view += found != Where.OUTSIDE
         hidden += found == Where.BEHIND
         through += found == Where.IN_FRONT

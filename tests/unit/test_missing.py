@@ -136,6 +136,44 @@ def test_what_photos_see_through_is_not_missing(half):
     assert not (both.cells.points[:, 1] > CENTER[1] + RADIUS).any()
 
 
+def test_nothing_is_missing_inside_the_wall_that_a_niche_is_in():
+    """Close-ups from its front, a flight from higher up; the wall goes on where the object's surroundings end."""
+
+    def sheet(low, high, normal, count):
+        points = np.random.default_rng(0).uniform(low, high, (count, 3))
+        return Cloud(points, np.tile(np.array(normal, np.float32), (count, 1)))
+
+    front, floor = (0, -1, 0), (0, 0, 1)
+    wall, ground = sheet((-8, 0, 0), (8, 0, 6), front, 200_000), sheet((-8, -9, 0), (8, 0, 0), floor, 200_000)
+    at = wall.points
+    wall = wall[(np.abs(at[:, 0]) > 1) | (at[:, 2] > 3)]
+    niche = [sheet((-1, 1, 0), (1, 1, 3), front, 12_000), sheet((-1, 0, 0), (1, 1, 0), floor, 4_000)]
+    niche += [sheet((x, 0, 0), (x, 1, 3), (-x, 0, 0), 6_000) for x in (-1, 1)]
+    niche += [sheet((-1, 0, 3), (1, 1, 3), (0, 0, -1), 4_000)]
+    obj = concatenate([*niche, wall[(np.abs(wall.points[:, 0]) < 1.5) & (wall.points[:, 2] < 3.5)]])
+
+    def photo(name, eye, middle):
+        k, pose = np.array([[180.0, 0, 120], [0, 180, 100], [0, 0, 1]]), np.eye(4)
+        pose[:3, :3] = look_at(np.array(eye), np.array(middle), UP)
+        pose[:3, 3] = -pose[:3, :3] @ eye
+        return View(name, k, pose, 240, 200, np.full((200, 240), 128, np.uint8))
+
+    def mask(view):
+        pixels = np.stack([*np.meshgrid(np.arange(240) + 0.5, np.arange(200) + 0.5), np.ones((200, 240))], axis=-1)
+        rays = pixels @ np.linalg.inv(view.intrinsics).T @ view.cam_from_world[:3, :3]
+        at = view.centre - rays * (view.centre[1] / rays[..., 1])[..., None]
+        return replace(view, pixels=(np.abs(at[..., 0]) < 1.5) & (at[..., 2] > 0) & (at[..., 2] < 3.5))
+
+    turns = np.radians(np.linspace(-60, 60, 9))
+    close = [photo(f"{z}{a}", (5 * np.sin(a), -5 * np.cos(a), z), (0, 0, 1.5)) for a in turns for z in (1.2, 2.6)]
+    flight = [photo(f"{x}{y}", (x, y, 2.5 - y), (0.3 * x, 0, 2)) for x in np.linspace(-8, 8, 8) for y in (-5.0, -7.0)]
+    completed = concatenate([obj, wall, ground])
+    missing = find_missing_surface(obj, completed, (pack(close), pack(flight)), [mask(view) for view in close])
+    x, y, z = missing.cells.points.T
+    within_wall = (y > 0) & (z > 0) & ((np.abs(x) > 1) | (z > 3) | (y > 1))
+    assert within_wall.sum() < 0.01 * missing.covered_cells
+
+
 def test_without_masks_only_the_own_points_count_and_a_note_says_so(half):
     photos, _, cloud = half
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), [])
