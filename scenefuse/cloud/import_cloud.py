@@ -53,10 +53,10 @@ def import_scene_cloud(
     sample = file.summary.sample
     own = crs_of(source, crs)
     unit, name = unit_and_name(own)
+    _check_axes(own, source)
     if own is not None:
-        from scenefuse.cloud.crs import check_place, usable
+        from scenefuse.cloud.crs import check_place
 
-        usable(own, str(source), local=True)
         check_place(own, sample, source)
     origin = near_origin(sample)
     shift = Sim3(1.0, np.eye(3), origin)
@@ -85,6 +85,14 @@ def crs_of(source: Path, said: str | None) -> "pyproj.CRS | None":
     return crs
 
 
+def _check_axes(crs: "pyproj.CRS | None", source: Path) -> None:
+    """StageError where the axes of a file's CRS stretch or mirror what lies in it (`crs.usable`)."""
+    if crs is not None:
+        from scenefuse.cloud.crs import usable
+
+        usable(crs, str(source), local=True)
+
+
 def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
     """Take a cloud for an object, in any frame and unit.
 
@@ -97,6 +105,7 @@ def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
         StageError: as of `import_scene_cloud`.
     """
     file = ImportedFile.of(source)
+    _check_axes(las_crs(source), source)
     whole, notes = without_strays(concatenate(list(file.clouds())), source.name)
     origin = near_origin(whole.points)
     placed = replace(whole, points=whole.points - origin)

@@ -169,6 +169,9 @@ def test_a_plane_in_feet_with_heights_in_metres_is_refused(tmp_path, cloud):
     source = write_as(tmp_path / "a.xyz", replace(cloud, points=cloud.points - cloud.points.mean(0) + [1e6, 2e5, 50]))
     with pytest.raises(StageError, match="counts US survey foot and metre; give heights in the unit of the plane"):
         imported_scene(tmp_path, source, "EPSG:2263+5703")
+    write_laz(tmp_path / "b.laz", Cloud(cloud.points - UTM), np.array([1e6, 2e5, 50.0]), "EPSG:2263+5703")
+    with pytest.raises(StageError, match=r"b\.laz: .* counts US survey foot and metre; give heights"):
+        import_object_cloud(source=tmp_path / "b.laz", cloud=tmp_path / "b.ply", report=tmp_path / "b.json")
 
 
 def test_clouds_near_zero_keep_their_coordinates_at_any_size():
