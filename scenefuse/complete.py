@@ -109,9 +109,10 @@ def _make_or_go_on(project: Path, flight: Path, objects: Sequence[Path], preset:
         known = [(row, there[row[kind]]) for row in rows if row[kind] in there]
         differs = any(held.get(key) != row[key] for row, held in known for key in row if key != "prompts")
         if differs or (new and (kind == "scene" or len(known) < len(there))):
+            more = "" if differs or kind == "scene" else f"; to add {new[0][kind]} to these, give their folders as well"
             raise StageError(
                 f"{project} holds another project ({kind}s: {', '.join(there)}); give another folder by --out, or,"
-                f" where these have moved, correct {project / table}"
+                f" where these have moved, correct {project / table}{more}"
             )
         for added in new:
             for column, cell in added.items():
