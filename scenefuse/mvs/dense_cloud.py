@@ -66,8 +66,8 @@ def fuse_depth_maps(
         settings: see DenseCloudSettings.
         cloud: output PLY in the workspace's frame: float64 positions, normals, colours, `views` (photos
             that agree on the point).
-        report: output JSON: number of points, spacing, backend, the share of the pixels with a depth that are in
-            the cloud, and a note where it is small.
+        report: output JSON: number of points, spacing, backend, the share of the pixels with a depth that enough photos
+            confirm, and a note where it is small.
 
     Raises:
         StageError: no depth maps, or no point on which enough photos agree.
@@ -82,7 +82,7 @@ def fuse_depth_maps(
     stages = [read_json(path) for path in depth_json]
     print(f"fusing {len(maps)} depth maps by {_all(stages, 'backend')}", flush=True)
     sources = {name: photo["sources"] for stage in stages for name, photo in stage["photos"].items()}
-    fused, pixel, measured = _fuse(workspace, maps, neighbours(sources), settings)
+    fused, pixel, share = _fuse(workspace, maps, neighbours(sources), settings)
     if len(fused) == 0:
         raise StageError(
             f"no point is seen alike by {settings.min_photos} photos; lower scene.dense_cloud.min_photos, or check the"
@@ -91,7 +91,7 @@ def fuse_depth_maps(
     near = near_others(fused.points, fused.fields.pop("pixel"))
     kept = voxel_downsample(fused[near], pixel)
     print(f"{len(kept)} points, {(~near).sum()} of {len(fused)} dropped as outliers before thinning", flush=True)
-    content = _report(kept, measured, stages, length_unit(georeference_json))
+    content = _report(kept, share, stages, length_unit(georeference_json))
     write_tiled(cloud, lambda: [kept], len(kept), kept.points)
     write_json(report, content | {"depth_maps": quantity(len(maps), "1")})
 
@@ -101,9 +101,9 @@ def _all(stages: list[dict[str, Any]], name: str) -> str:
     return ", ".join(sorted({value(stage, name) for stage in stages}))
 
 
-def _report(cloud: Cloud, measured: int, stages: list[dict[str, Any]], unit: str) -> dict[str, Any]:
+def _report(cloud: Cloud, share: float, stages: list[dict[str, Any]], unit: str) -> dict[str, Any]:
     """The cloud in numbers, with a note where it holds few of the measured pixels; and how its depth maps were made."""
-    share, notes = float(cloud.fields["views"].sum() / max(measured, 1)), []
+    notes = []
     if share < MIN_FUSED_SHARE:
         notes.append(
             f"only {share:.2%} of the pixels with a depth are in the cloud: the photos' depths disagree; look at"
@@ -123,9 +123,9 @@ def _report(cloud: Cloud, measured: int, stages: list[dict[str, Any]], unit: str
 
 def _fuse(
     workspace: Path, maps: Mapping[str, Path], near: Mapping[str, list[str]], settings: DenseCloudSettings
-) -> tuple[Cloud, float, int]:
+) -> tuple[Cloud, float, float]:
     """A cloud of the pixels that enough maps confirm, with `views` and the size of each, `pixel`; that of the finest
-    map's pixels on the surface; and how many pixels have a depth.
+    map's pixels on the surface; and which share of the pixels with a depth they are.
 
     Where several maps show a place, the finest one on the whole gives its points, and each that is finer there.
 
@@ -141,7 +141,7 @@ def _fuse(
     measured = lru_cache(MAX_PHOTOS)(lambda name: _read_map(cameras[name], workspace / "images", maps[name]))
     confirmed: dict[str, NDArray[np.uint8]] = {}  # eight pixels in one number
     pixel: dict[str, float] = {}
-    count = 0
+    count = stay = 0
     for name in sorted(maps):
         own = measured(name)
         votes = vote(own, map(measured, near[name]), *limits)
@@ -149,7 +149,7 @@ def _fuse(
         if settings.min_photos < 2:
             stays |= votes.through == 0
         stays &= (own.view.pixels > 0) & (votes.agree + 1 >= settings.min_photos)
-        count += int((own.view.pixels > 0).sum())
+        count, stay = count + int((own.view.pixels > 0).sum()), stay + int(stays.sum())
         confirmed[name] = np.packbits(stays)
         pixel[name] = float(np.median(own.view.pixels[stays])) / own.view.intrinsics[0, 0] if stays.any() else math.inf
 
@@ -168,7 +168,7 @@ def _fuse(
             fine[*pixels] = other.view.project(points)[1] / other.view.intrinsics[0, 0] <= 1.2 * size
             own = _only(own, vote(_only(own, fine), [other], *limits).agree == 0)
         parts.append(_points(own, vote(own, map(measured, near[name]), *limits)))
-    return concatenate(parts), min(pixel.values()), count
+    return concatenate(parts), min(pixel.values()), stay / max(count, 1)
 
 
 def _read_map(camera: View, photos: Path, folder: Path) -> DepthMap:

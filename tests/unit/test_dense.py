@@ -233,6 +233,8 @@ def test_a_high_flight_stays_beside_a_low_one(tmp_path):
     assert set(cloud.fields) == {"views"}
     apart = np.abs(cloud.points[:, :2]).max(1)
     assert (apart < 0.5).sum() > 1000 and ((apart > 2) & (apart < 7)).sum() > 1000
+    # Nearly all pixels are confirmed; a coarse one that confirms a hundred points is one.
+    assert 0.9 < value(read_json(tmp_path / "dense.json"), "fused_share") <= 1
 
 
 def test_a_high_flight_makes_the_points_of_a_low_one_no_less_exact(tmp_path):
