@@ -57,12 +57,13 @@ def export(arguments: list[str], settings_files: list[Path]) -> int:
     scenes = sorted(name for name in project.scenes if Path(f"results/scenes/{name}/dense.ply").is_file())
     # Given clouds have no cameras, and a scene that was not completed has no tiles.
     needed = {"cameras": "results/*/*/undistorted", "tiles": "results/scenes/*/completed.ply", "pdf": str(REPORT)}
-    what = [item for item in words.what if any(Path().glob(needed.get(item, "*")))]
+    asked = words.what or [*EXPORTS]
+    what = [item for item in asked if any(Path().glob(needed.get(item, "*")))]
     what, names = [item for item in what if names or "{object}" not in EXPORTS[item]], names or [""]
     targets = {EXPORTS[item].format(object=name, scene=scene) for item in what for name in names for scene in scenes}
     targets = {t for t in targets if not t.endswith("/tiles") or Path(t).with_name("completed.ply").is_file()}
     if not targets:
-        sys.exit(f"error: there is nothing to export as {', '.join(words.what)}; {SUMMARY} says what the run made")
+        sys.exit(f"error: there is nothing to export as {', '.join(asked)}; {SUMMARY} says what the run made")
     ended = subprocess.run([*RUN, *sorted(targets), *others, "--allowed-rules", *RULES]).returncode
     if ended or {"-n", "--dry-run", "--dryrun"} & set(others):
         return ended
@@ -110,8 +111,9 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
         " Nothing before them runs again.",
         epilog="All other options are those of scenefuse run, as -n to see what would be made.",
     )
-    parser.add_argument("--what", nargs="+", choices=EXPORTS, default=list(EXPORTS), help="default: all of them")
-    parser.add_argument("--object", nargs="+", dest="names", metavar="NAME", help="default: all that are finished")
+    parser.add_argument("--what", nargs="+", action="extend", choices=EXPORTS, help="default: all of them")
+    finished = "default: all that are finished"
+    parser.add_argument("--object", nargs="+", action="extend", dest="names", metavar="NAME", help=finished)
     facade = "three points of a facade of one object, to draw it as well"
     parser.add_argument("--facade", nargs=9, type=float, metavar=("X", "Y", "Z") * 3, help=facade)
     parser.add_argument("--zip", type=Path, metavar="FILE", help="and all of it with the report in one file to send")

@@ -687,12 +687,16 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
     with pytest.raises(SystemExit):
         command_line.main()
     assert [word for word in runs[2] if word.endswith("/tiles")] == ["results/scenes/yard/tiles"]
+    monkeypatch.setattr(sys, "argv", ["scenefuse", "export", "--object", "shed", "--object", "barn"])
+    with pytest.raises(SystemExit):
+        command_line.main()
+    assert {"results/objects/shed/surface.glb", "results/objects/barn/surface.glb"} <= set(runs[4])
     # Rows are removed from the tables, and their results stay.
     write_tables(["field"], ["barn"])
     monkeypatch.setattr(sys, "argv", ["scenefuse", "export"])
     with pytest.raises(SystemExit):
         command_line.main()
-    made = {word for word in runs[4] if word.startswith("results/")}
+    made = {word for word in runs[6] if word.startswith("results/")}
     assert made == {
         f"results/{name}" for name in ("objects/barn/surface.glb", "objects/barn/drawings", "summary/report.pdf")
     }
