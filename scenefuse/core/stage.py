@@ -85,6 +85,10 @@ def run(function: Callable[..., Any]) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _exit_on_signal)
     try:
+        named = [word.partition("=")[0] for word in sys.argv[1:] if word.startswith("--")]
+        # tyro would take the last.
+        if twice := next((name for name in named if named.count(name) > 1), ""):
+            raise StageError(f"{twice} is given twice; give it once, with all its values")
         markers = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
         status = tyro.cli(function, config=markers)
     except SystemExit as stop:

@@ -134,6 +134,21 @@ def test_what_cannot_be_written_is_named_without_its_temporary_name(monkeypatch,
     assert capsys.readouterr().err.startswith("error: results/objects/house: read-only file system; check the folder")
 
 
+def test_an_option_that_is_given_twice_loses_no_value(monkeypatch, capsys):
+    def stage(*, objects: tuple[str, ...] = ()) -> None:
+        """Take all that are named."""
+        print(objects)
+
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(sys, "argv", ["stage", "--objects", "house", "--objects=shed"])
+    with pytest.raises(SystemExit, match="1"):
+        run(stage)
+    assert capsys.readouterr().err == "error: --objects is given twice; give it once, with all its values\n"
+    monkeypatch.setattr(sys, "argv", ["stage", "--objects", "house", "shed"])
+    run(stage)
+    assert capsys.readouterr().out == "('house', 'shed')\n"
+
+
 def test_too_little_memory_is_one_sentence(monkeypatch, capsys):
     def stage() -> None:
         """Take more than there is."""
