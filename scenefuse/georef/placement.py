@@ -195,12 +195,7 @@ def place_by_control(
         )
     agree = whole & inliers
     check_spread(there[agree], [n for n, a in zip(names, agree) if a], where)
-    # Swapped axes turn it by half a turn; what photos say of up may be a quarter off.
-    if fitted.rotate(up)[2] < -0.5:
-        raise StageError(
-            f"{where}: the control points turn the model upside down, as swapped axes do; x has to be easting or"
-            " longitude, y northing or latitude"
-        )
+    _check_upright(fitted, up, f"{where}: the control points")
     used = np.zeros(len(located), dtype=bool)
     used[rows[inliers]] = True
     notes = [
@@ -210,6 +205,16 @@ def place_by_control(
     reason = f"{inliers.sum()} of {len(rows)} control points"
     none = np.zeros(0, dtype=bool)
     return Placement("georeferenced", reason, fitted, none, "measured", False, used), notes
+
+
+def _check_upright(fitted: Sim3, up: Array, what: str) -> None:
+    """StageError where a fit to what was surveyed turns the cameras' up direction (3,) down."""
+    # Swapped axes turn it by half a turn; what photos say of up may be a quarter off.
+    if fitted.rotate(up)[2] < -0.5:
+        raise StageError(
+            f"{what} turn the model upside down, as swapped axes do; x has to be easting or longitude, y northing or"
+            " latitude"
+        )
 
 
 def beside_gps(
@@ -313,6 +318,9 @@ def place_by_gps(
     well contradict it, as a phone's do on a walk around a house. Positions within four times the GPS accuracy of each
     other say nothing about scale: then the model is only turned upright. `sd_m` is the accuracy that the positions
     state.
+
+    Raises:
+        StageError: positions that turn the model upside down.
     """
     fresh = _first_at(target)
     accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target[fresh])
@@ -325,6 +333,7 @@ def place_by_gps(
     if inliers.sum() < max(PHOTOS_OF_ONE_ERROR, 0.5 * fresh.sum()):
         reason = f"only {inliers.sum()} of {len(target)} GPS positions agree with the cameras within {limit:g} m"
         return upright(up, reason)
+    _check_upright(fitted, up, "the photos' positions (EXIF, geo.txt; use_gps: false leaves them out)")
     reason = f"{inliers.sum()} of {len(target)} photos by GPS"
     if levelled:
         line = "along one line, " if not _tells_scale(_extent(target[inliers])[1], accuracy_m) else ""

@@ -126,6 +126,12 @@ def test_planted_similarity_with_noise_and_two_wild_positions():
     assert np.linalg.norm(fitted.apply(centres) - target, axis=1).max() < 1.0
 
 
+def test_positions_whose_axes_are_swapped_in_a_grid_that_holds_both_turn_no_model_upside_down():
+    target, up = flight(), PLANTED.rotation.T @ [0, 0, 1]
+    with pytest.raises(StageError, match="the photos' positions .* turn the model upside down, as swapped axes do"):
+        place_by_gps(PLANTED.inverse().apply(target), target[:, [1, 0, 2]], up, SETTINGS, seed=0)
+
+
 def test_one_strip_is_levelled_by_the_cameras():
     target = flight(rows=1, columns=12)
     target[:, 2] = 60.0
