@@ -143,9 +143,11 @@ def facade_axes(surface: Surface, points: Array) -> Array:
         raise StageError("the three points of the facade lie in a line; click three of its corners")
     normal = np.cross(points[1] - points[0], points[2] - points[0])
     toward, vertices = normal / np.linalg.norm(normal), surface.vertices
-    beside = np.abs((vertices.points - points[0]) @ toward) <= MARGIN * vertices.diagonal
+    distance = np.abs((vertices.points - points[0]) @ toward)
+    # The other side of a thin wall is beside the plane too, but farther off than most of this one.
+    nearest = np.argsort(distance)[: (np.count_nonzero(distance <= MARGIN * vertices.diagonal) + 1) // 2]
     assert vertices.normals is not None
-    toward *= -1.0 if (vertices.normals[beside] @ toward).sum() < 0 else 1.0
+    toward *= -1.0 if (vertices.normals[nearest] @ toward).sum() < 0 else 1.0
     # Up is y where the plane is level.
     upright = UP if abs(toward @ UP) < 1 - MARGIN else np.array([0.0, 1, 0])
     right = np.cross(upright, toward)

@@ -459,6 +459,13 @@ def test_a_facade_is_drawn_of_the_plane_through_three_points_from_outside(coarse
         np.testing.assert_allclose(
             facade_axes(coarse, CORNERS[order]), [np.cross([0, 0, 1], TOWARD), [0, 0, 1], TOWARD], atol=1e-9
         )
+    # A wall of a hand's breadth, of which the other side has more points.
+    x, z = (a.ravel() for a in np.meshgrid(np.linspace(0, 30, 300), np.linspace(0, 3, 30)))
+    front, back = (np.column_stack([x[::k], 0 * x[::k] + y, z[::k]]) for k, y in ((2, 0.0), (1, 0.15)))
+    outward = np.concatenate([0 * front - [0, 1, 0], 0 * back + [0, 1, 0]]).astype(np.float32)
+    wall = replace(coarse, vertices=Cloud(np.concatenate([front, back]), outward))
+    for order in ([0, 1, 2], [1, 0, 2]):
+        assert facade_axes(wall, np.array([[0, 0, 0], [30, 0, 0], [0, 0, 3.0]])[order])[2] @ [0, -1, 0] > 0.99
     heights = rasterio.open(placed / "facade_height.tif").read(1)
     # Its front stands half a radius before the plane, and half of it lies behind.
     assert np.nanmax(heights) == pytest.approx(0.5, abs=0.01) and np.nanmin(heights) < 0
