@@ -95,9 +95,11 @@ def supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> ND
     step = spacing(points)
     on_plane = np.pi * (RESOLUTION * diagonal / step) ** 2 if step > 0 else MAX_NEIGHBOURS
     count = min(int(np.clip(on_plane, NEIGHBOURS, MAX_NEIGHBOURS)) + 1, len(points))
-    near = cKDTree(points).query(points[measured], k=count, workers=threads())[1]
-    found = measured.copy()
-    found[measured] = measured[near.reshape(-1, count)].mean(1) >= SUPPORT
+    tree, found = cKDTree(points), measured.copy()
+    # At a time some: the neighbours of tens of millions of points fill a computer's memory.
+    for rows in np.array_split(np.flatnonzero(measured), 1 + len(points) * count // AT_ONCE):
+        near = tree.query(points[rows], k=count, workers=threads())[1]
+        found[rows] = measured[near.reshape(-1, count)].mean(1) >= SUPPORT
     return found
 
 

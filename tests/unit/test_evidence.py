@@ -1,5 +1,6 @@
 """Evidence on a painted plane: the photos of both sides decide what is added, kept and taken away."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -68,6 +69,18 @@ def test_a_cloud_without_normals_is_measured_as_one_with_them(near, far, bare):
     found = check(obj, scene, moved_photos(near, turn), moved_photos(far, turn), unconfirmed="none")
     assert (found.obj.fields["evidence"] == Evidence.MEASURED).mean() > 0.95 and found.added.mean() > 0.95
     assert (found.scene.fields["evidence"] == Evidence.MEASURED).mean() > 0.95
+
+
+def test_neighbours_of_a_large_cloud_are_looked_at_a_part_at_a_time(monkeypatch):
+    monkeypatch.setattr(measure, "AT_ONCE", 1 << 16)
+    points = sheet(-0.6, 0.6, 0.005).points
+    half = points[:, 0] < 0
+    tracemalloc.start()
+    found = measure.supported(points, half, 2.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200 * len(points)
+    assert found[points[:, 0] < -0.03].all() and not found[~half].any()
 
 
 @pytest.mark.slow
