@@ -16,7 +16,6 @@ from scenefuse.core.transforms import FIXING_POINTS, MAX_DEVIATIONS, Array, Sim3
 from scenefuse.georef.control import CHECK, Control, read_control_points
 from scenefuse.georef.on_cloud import lay_on_cloud
 from scenefuse.georef.placement import (
-    MAX_GPS_OFF_M,
     PHOTOS_OF_ONE_ERROR,
     ROBUST_SD,
     GeoreferenceSettings,
@@ -34,7 +33,7 @@ from scenefuse.georef.residuals import Georeference, georeference_report, residu
 from scenefuse.marks.clicks import Click
 from scenefuse.marks.triangulation import read_lengths
 from scenefuse.photos.cameras.given import Place, read_place
-from scenefuse.photos.geodesy import LocalFrame, local_frame
+from scenefuse.photos.geodesy import MAX_GPS_OFF_M, LocalFrame, local_frame
 from scenefuse.photos.photos import Photo, gps_accuracies, gps_positions, read_photos
 from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.sfm.colmap import Freedom, adjustment_options, drop_outliers

@@ -18,7 +18,7 @@ from scenefuse.core.transforms import (
     rotation_between,
 )
 from scenefuse.georef.control import LocatedPoint, check_spread, describe_misses
-from scenefuse.photos.geodesy import MAX_MEDIAN_DISTANCES, local_frame
+from scenefuse.photos.geodesy import MAX_GPS_OFF_M, MAX_MEDIAN_DISTANCES, local_frame
 from scenefuse.sfm.gravity import MAX_VERTICAL_SD_DEG
 
 Array = NDArray[np.float64]
@@ -29,8 +29,6 @@ HEIGHT_ERROR, PHOTOS_OF_ONE_ERROR = 2.0, 5
 # How far a model may be bent, as a share of its extent: away from exact positions before it is adjusted to them, and
 # an object's before its pose is of no use.
 MAX_BENT = 0.1
-# Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
-MAX_GPS_OFF_M = 1000.0
 # In standard deviations: error of a control point or a position at which it loses half its weight (Cauchy).
 ROBUST_SD = 3.0
 

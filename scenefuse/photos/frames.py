@@ -36,7 +36,7 @@ from scenefuse.photos.photos import (
     write_photos,
 )
 from scenefuse.photos.pictures import write_picture
-from scenefuse.photos.positions import check_order, positions_of, read_geo
+from scenefuse.photos.positions import check_beside_exif, positions_of, read_geo
 from scenefuse.photos.subtitles import positions_in_subtitles
 
 Origin = dict[str, dict[str, Any]]
@@ -154,7 +154,7 @@ def _linked(folder: Path, output: Path) -> tuple[list[Photo], dict[str, int], li
     turned = {p.name: p.orientation for p in stored if p.orientation != 1}
     if geo:
         places = positions_of(names, positions, geo)
-        check_order(places, [asdict(photo) for photo in listed], geo)
+        check_beside_exif(places, [asdict(photo) for photo in listed], geo)
         listed = [replace(p, position_note="", **place) for p, place in zip(listed, places)]
     notes = copies + below_folder(names) + photo_notes(listed, bits)
     if geo:

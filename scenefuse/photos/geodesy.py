@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 # Of positions spread evenly, none is farther from the middle than twice the median distance. Only wild ones are farther
 # than this many.
 MAX_MEDIAN_DISTANCES = 10.0
+# What was surveyed farther from where GPS saw the cameras, in metres, is in another CRS or has swapped axes.
+MAX_GPS_OFF_M = 1000.0
 
 
 @dataclass(frozen=True)

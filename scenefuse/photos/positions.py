@@ -12,6 +12,7 @@ from scenefuse.cloud.crs import read_crs, to_wgs84
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import comma_advice, read_lines
 from scenefuse.core.transforms import Array
+from scenefuse.photos.geodesy import MAX_GPS_OFF_M, local_frame
 from scenefuse.photos.photo_files import SUFFIXES, photos_by_name
 
 LAYOUT = "photo x y [z [yaw pitch roll [horizontal sd [vertical sd]]]]"
@@ -220,18 +221,32 @@ def positions_of(names: list[str], positions: dict[str, Position], path: Path) -
     return [asdict(positions[found[name]] if name in found else Position()) for name in names]
 
 
-def check_order(given: list[dict[str, Any]], stated: list[dict[str, Any]], path: Path) -> None:
-    """StageError where positions of photos that a file gives lie nearer to those of EXIF with latitude and longitude
-    swapped: both are the fields of a `Position`, photo by photo."""
+def check_beside_exif(given: list[dict[str, Any]], stated: list[dict[str, Any]], path: Path) -> None:
+    """StageError where positions of photos that a file gives lie far from those of EXIF, as in another zone, or with
+    latitude and longitude swapped: both are the fields of a `Position`, photo by photo."""
     names = ("latitude_deg", "longitude_deg")
     both = [[[one[name] for name in names] for one in pair] for pair in zip(given, stated)]
     table: Array = np.array([pair for pair in both if None not in [*pair[0], *pair[1]]]).reshape(-1, 2, 2)
-    off, swapped = (np.abs(table[:, 0, order] - table[:, 1]).max(1) for order in ([0, 1], [1, 0]))
-    if len(table) and 10 * np.median(swapped) < np.median(off):
+    if not len(table):
+        return
+    # Heights are not compared.
+    by_file, swapped, by_exif = (np.insert(t, 2, np.nan, axis=1) for t in (table[:, 0], table[:, 0, ::-1], table[:, 1]))
+    frame = local_frame(by_exif)
+    off_m, swapped_m = (
+        float(np.median(np.linalg.norm((frame.apply(places) - frame.apply(by_exif))[:, :2], axis=1)))
+        for places in (by_file, swapped)
+    )
+    if off_m <= MAX_GPS_OFF_M:
+        return
+    if swapped_m <= MAX_GPS_OFF_M:
         raise StageError(
             f"{path} gives latitude before longitude, as the positions in the photos' EXIF show; write the longitude"
             " (x) first"
         )
+    raise StageError(
+        f"{path} gives positions {off_m / 1000:.3g} km from those in the photos' EXIF; correct its CRS or swapped axes,"
+        " or remove GPS from the EXIF if that is wrong"
+    )
 
 
 def _position(place: Array, sd: Array) -> Position:

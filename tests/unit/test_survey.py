@@ -469,11 +469,11 @@ def test_a_geo_file_takes_the_place_of_exif(tmp_path, capsys, name):
     folder = tmp_path / "flight"
     for photo in ("a.jpg", "b.jpg", "c.jpg"):
         a_photo(folder, photo)
-    x, y = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(8.5, 47.4)
+    x, y = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(8.25, 47.501)
     lines = ["EPSG:32632", f"a.jpg {x} {y} 431.5 10 -90 0 0.02 0.04", f"b.jpg {x + 5} {y}", f"z.jpg {x} {y}"]
     (folder / name).write_text("\n".join(lines))
     photos = listed(folder, tmp_path)
-    assert photos["a.jpg"].latitude_deg == pytest.approx(47.4, abs=1e-8)
+    assert photos["a.jpg"].latitude_deg == pytest.approx(47.501, abs=1e-8)
     assert (photos["a.jpg"].altitude_m, photos["a.jpg"].vertical_sd_m) == (431.5, 0.04)
     assert photos["b.jpg"].altitude_m is None and photos["b.jpg"].has_gps
     assert not photos["c.jpg"].has_gps and "gives 2 of 3 positions" in capsys.readouterr().out
@@ -501,8 +501,15 @@ def test_a_bad_geo_file_is_named(tmp_path, text, words):
         listed(tmp_path / "flight", tmp_path)
 
 
-@pytest.mark.parametrize("swapped", [True, False])
-def test_latitude_before_longitude_shows_beside_exif(tmp_path, capsys, swapped):
+@pytest.mark.parametrize(
+    ("first", "words"),
+    [
+        ("EPSG:4326", "geo.txt gives latitude before longitude, as the positions in"),
+        ("EPSG:32633", r"geo.txt gives positions 452 km from those in the photos' EXIF; correct its CRS or swapped"),
+        ("", ""),
+    ],
+)
+def test_a_wrong_zone_or_latitude_before_longitude_shows_beside_exif(tmp_path, capsys, first, words):
     folder = tmp_path / "flight"
     rows = []
     for k in range(3):
@@ -512,10 +519,11 @@ def test_latitude_before_longitude_shows_beside_exif(tmp_path, capsys, swapped):
         folder.mkdir(exist_ok=True)
         picture.putpixel((k, 0), (255, 0, 0))
         picture.save(folder / f"{k}.jpg", exif=exif)
-        rows.append(" ".join(map(str, [f"{k}.jpg", *(place[::-1] if swapped else place)])))
-    (folder / "geo.txt").write_text("\n".join(["EPSG:4326", *rows]))
-    if swapped:
-        with pytest.raises(StageError, match="geo.txt gives latitude before longitude, as the positions in"):
+        place = place[::-1] if first == "EPSG:4326" else [462_256 + 8 * k, 5_249_700] if first else place
+        rows.append(" ".join(map(str, [f"{k}.jpg", *place])))
+    (folder / "geo.txt").write_text("\n".join([first or "EPSG:4326", *rows]))
+    if words:
+        with pytest.raises(StageError, match=words):
             listed(folder, tmp_path)
     else:
         assert listed(folder, tmp_path)["0.jpg"].longitude_deg == 8.5
