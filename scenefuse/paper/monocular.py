@@ -17,6 +17,7 @@ from torch.nn import functional
 from scenefuse.core.checkpoints import State, read_state
 from scenefuse.core.stage import StageError, quantity, setting
 from scenefuse.core.transforms import Array, rotation_angle_deg
+from scenefuse.mvs.plane_sweep import MIN_TEXTURE
 from scenefuse.nerf.rendered_maps import MAP_AGREEMENT
 from scenefuse.paper.depth_photos import DepthPhotos, residual_at_checks
 from scenefuse.paper.monodepth import (
@@ -38,8 +39,6 @@ from scenefuse.photos.views import Views
 NEAR = 0.5
 # Photos are compared at these fractions of their size one after the other, in equal parts of the training.
 SHRINKS = (4, 2, 1)
-# Frames that differ less on the object, on the mean, show no motion: two grey levels.
-MIN_CHANGE = 2 / 255
 Content = dict[str, Any]
 
 # Depths that differ by more standard deviations are of different surfaces.
@@ -204,7 +203,7 @@ def neighbours(trained: NDArray[np.bool_]) -> NDArray[np.int64]:
 def _check_motion(frames: DepthPhotos) -> None:
     """StageError where no frame differs from the next: depth and poses are learned from parallax alone."""
     change = (frames.images - frames.images[frames.sources[:, 1]]).abs().mean(1, keepdim=True)
-    if float(masked_mean(change, frames.masks)) < MIN_CHANGE:
+    if float(masked_mean(change, frames.masks)) < MIN_TEXTURE:
         raise StageError(
             "the object looks the same in all frames: without motion of the camera there is no parallax to learn depth "
             "and poses from; walk around the object, or set object.frames.frame_step higher"
