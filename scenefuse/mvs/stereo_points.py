@@ -35,7 +35,7 @@ def with_stereo_points(photos: Workspace) -> Workspace:
     Args:
         photos: views with RGB pixels, sparse points and who observes them.
     """
-    small = [replace(view, pixels=_gray(view)).at_most(STEREO.max_image_size_px) for view in photos.views]
+    small = [gray(view).at_most(STEREO.max_image_size_px) for view in photos.views]
     try:
         chosen = select_views(replace(photos, views=small), STEREO.sources, STEREO.min_angle_deg)
     except StageError:
@@ -64,9 +64,9 @@ def with_stereo_points(photos: Workspace) -> Workspace:
     return replace(photos, points=points, seen=seen, seen_at=seen_at, by_stereo=len(points) - count)
 
 
-def _gray(view: View) -> NDArray[np.float32]:
-    """(H, W) grey values of an RGB photo, 0..1."""
-    return np.asarray(view.pixels.mean(axis=2, dtype=np.float32) / 255)
+def gray(view: View) -> View:
+    """An RGB photo in grey, (H, W) float32 in 0..1."""
+    return replace(view, pixels=view.pixels.mean(axis=2, dtype=np.float32) / np.float32(255))
 
 
 def _new_points(view: View, depth: DepthMap, known: Array) -> Array:

@@ -18,10 +18,9 @@ from scenefuse.core.transforms import Array
 from scenefuse.geometry.surface import ends_of
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.sparse_depths import MIN_SHARED_POINTS, beside_mask, own_points, pair_worth
-from scenefuse.mvs.stereo_points import FEW_POINTS, with_enough_points
+from scenefuse.mvs.stereo_points import FEW_POINTS, gray, with_enough_points
 from scenefuse.nerf.rendered_maps import MAP_AGREEMENT, confirm, write_prior
 from scenefuse.photos.views import Views, load_views
-from scenefuse.photos.workspace import View
 
 # Stereo sees photos cut to the object, about this many pixels squared.
 CROP_PX = 144
@@ -224,7 +223,7 @@ def _choose_sources(views: Views, seen: list[NDArray[np.int64]], count: int) -> 
 def first_depth(views: Views, known: ObjectPoints, index: int) -> Map:
     """(H, W) depth of a photo: inverse depths by stereo and between SfM points, weighted by stereo's score."""
     between = _between_points(views, known, index)
-    reference, *sources = (_gray(views, row) for row in (index, *known.sources[index].tolist()))
+    reference, *sources = (gray(views.view(row)) for row in (index, *known.sources[index].tolist()))
     device = "cuda" if torch.cuda.is_available() else "cpu"
     near, far = float(known.near[index]), float(known.far[index])
     found = estimate_depth(reference, sources, near, far, STEREO, device)
@@ -252,9 +251,3 @@ def _between_points(views: Views, known: ObjectPoints, index: int) -> Array:
     distance, neighbour = distance.reshape(-1, near_by), neighbour.reshape(-1, near_by)
     weight = 1.0 / (distance**2 + 1.0)
     return ((inverse[keep][neighbour] * weight).sum(1) / weight.sum(1)).reshape(height, width)
-
-
-def _gray(views: Views, index: int) -> View:
-    """A cut photo in grey, (H, W) float32 in 0..1."""
-    view = views.view(index)
-    return replace(view, pixels=view.pixels.mean(2, dtype=np.float32) / np.float32(255))

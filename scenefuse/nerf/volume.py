@@ -78,13 +78,10 @@ def silhouettes(
     sizes: (V, 2) rows and columns of each photo, where they differ (`Views.sizes`).
     """
     shapes = [masks.shape[1:]] * len(masks) if sizes is None else sizes.tolist()
-    cam_from_object = np.tile(np.eye(4), (len(masks), 1, 1))
-    cam_from_object[:, :3, :3] = object_from_cam[:, :3, :3].transpose(0, 2, 1)
-    cam_from_object[:, :3, 3] = -np.einsum("vij,vi->vj", object_from_cam[:, :3, :3], object_from_cam[:, :3, 3])
     outlines = []
-    for row, (height, width) in enumerate(shapes):
+    for row, ((height, width), pose) in enumerate(zip(shapes, np.linalg.inv(object_from_cam))):
         part = np.s_[row, :height, :width]
-        view = View("", intrinsics[row], cam_from_object[row], width, height, masks[part])
+        view = View("", intrinsics[row], pose, width, height, masks[part])
         outlines.append(Outline(view, None if depths is None else depths[part]))
     return outlines
 
