@@ -94,7 +94,8 @@ def import_photos(
                 held_out += [view.name] if photo.held_out else []
         if not kept:
             raise StageError(_no_masks(data, photos, masks))
-        require_white_object(map(read_mask, sorted(folder.iterdir())), masks or data)
+        if not exact:  # what is cut out of a photo is the object, also an arch with its opening in the middle
+            require_white_object(map(read_mask, sorted(folder.iterdir())), masks or data)
         write_model(output / "sparse", kept)
         if held_out:
             (output / "held_out.txt").write_text("".join(f"{name}\n" for name in held_out))

@@ -341,6 +341,16 @@ def test_masks_that_are_black_on_the_object_are_an_error(tmp_path):
     assert not (tmp_path / "masks").exists()
 
 
+def test_an_arch_that_is_cut_out_of_its_photos_is_no_object_in_black(tmp_path):
+    data = nerfstudio(tmp_path / "in", masks=False)
+    opening = np.hypot(*np.mgrid[-32:32, -48:48]) < 25
+    for photo in (data / "images").iterdir():
+        matte = np.where(opening, 0, 255).astype(np.uint8)
+        cv2.imwrite(str(photo), np.dstack([cv2.imread(str(photo)), matte]))
+    imported(data, tmp_path)
+    assert all((cv2.imread(str(mask), 0) == 0).mean() > 0.2 for mask in (tmp_path / "masks").iterdir())
+
+
 def test_two_colours_as_bright_as_each_other_are_no_mask(tmp_path):
     labels = np.full((64, 96, 3), (0, 0, 255), np.uint8)
     labels[20:40, 30:60] = 0, 255, 0
