@@ -416,7 +416,5 @@ def _directions(points: Array, eye: Array) -> Array:
 def _shown_in_all(photos: list[View], cells: Cloud, obstacles: Cloud, step: float, margin: float) -> NDArray[np.bool_]:
     """(K,) cells that all the photos show."""
     assert cells.normals is not None
-    shown = np.ones(len(cells), dtype=bool)
-    for photo in photos:
-        shown &= shown_in(cells.points, cells.normals, obstacles, photo, step, margin)
-    return shown
+    shown = [shown_in(cells.points, cells.normals, obstacles, photo, step, margin) for photo in photos]
+    return np.asarray(np.logical_and.reduce(shown))

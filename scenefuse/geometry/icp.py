@@ -101,7 +101,8 @@ def refine_planes(
             system[6], system[:, 6], right[6], system[6, 6] = 0, 0, 0, 1
         step = np.asarray(-np.linalg.solve(system * (1 + 1e-9 * np.eye(7)), right), np.float64)
         pose = moved_about(pose, step, rows.centre, scales)
-        if _motion(step, rows) < 0.005 * tau:
+        # How far the step moves the paired points.
+        if np.linalg.norm(step[3:6]) + rows.reach * (np.linalg.norm(step[:3]) + abs(step[6])) < 0.005 * tau:
             break
     return pose
 
@@ -168,11 +169,6 @@ def change_between(pose: Sim3, other: Sim3, at: Array) -> Array:
     have (3,) of the object."""
     turn = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()
     return np.array([*turn, *(other.apply(at) - pose.apply(at)), np.log(other.scale / pose.scale)])
-
-
-def _motion(step: Array, rows: "_Rows") -> float:
-    """How far a step moves the paired points, scene units."""
-    return float(np.linalg.norm(step[3:6]) + rows.reach * (np.linalg.norm(step[:3]) + abs(step[6])))
 
 
 @dataclass(frozen=True)

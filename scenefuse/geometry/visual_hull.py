@@ -48,11 +48,6 @@ class Box:
     low: Array
     high: Array
 
-    def corners(self) -> Array:
-        """(8, 3) corners in the object's frame."""
-        picks = np.array([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)], dtype=bool)
-        return self.to_object(np.where(picks, self.high, self.low))
-
     def to_object(self, x_in_box: Array) -> Array:
         """(N, 3) points from the box's axes to the object's frame."""
         return x_in_box @ self.object_from_box[:, :3].T + self.object_from_box[:, 3]
@@ -74,12 +69,10 @@ class Hull:
     Attributes:
         shell: (N, 3) centres of the occupied voxels that have a free neighbour, in the object's frame.
         voxel: side of a voxel, in object units.
-        volume: occupied share of the box, 0..1.
     """
 
     shell: Array
     voxel: float
-    volume: float
 
 
 class Outline(NamedTuple):
@@ -197,7 +190,7 @@ def carve(
     occupied[alive] = enough & (missed[alive] <= tolerance * shown[alive])
     grid = occupied.reshape(shape)
     shell = grid & ~ndimage.binary_erosion(grid)
-    return Hull(centres[shell.ravel()] + middle, float(size), float(grid.mean()))
+    return Hull(centres[shell.ravel()] + middle, float(size))
 
 
 def silhouette(hull: Hull, view: View) -> Mask:

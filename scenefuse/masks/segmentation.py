@@ -68,13 +68,11 @@ class ScoredMasks:
         masks: (H, W) each.
         scores: IoU of each with the outline of the hull, 0..1.
         dropped: why a photo has no usable mask.
-        hull: of all masks.
     """
 
     masks: dict[str, Mask]
     scores: dict[str, float]
     dropped: dict[str, str]
-    hull: Hull
 
 
 def segment_by_grabcut(
@@ -163,7 +161,7 @@ def score_masks(
             dropped[view.name] = "empty mask"
         elif scores[view.name] < settings.min_agreement and view.name not in clicked:
             dropped[view.name] = f"IoU with the visual hull is {scores[view.name]:.2f}, below {settings.min_agreement}"
-    return ScoredMasks({view.name: mask for view, mask in zip(views, masks)}, scores, dropped, hull)
+    return ScoredMasks({view.name: mask for view, mask in zip(views, masks)}, scores, dropped)
 
 
 def carve_consistent(

@@ -141,7 +141,7 @@ def test_masks_of_a_thin_pole_agree_with_their_hull():
 def test_a_hull_of_a_wall_has_no_holes_where_the_photo_is_near():
     along = photo("", (-12.0, -2.0, 1.7), (-4, 0, 3), 60, FACADE, 640, 480)
     cells = np.meshgrid(*(np.arange(low + 0.25, high, 0.5) for low, high in zip(*FACADE[0])), indexing="ij")
-    hull = Hull(np.stack(cells, axis=-1).reshape(-1, 3), 0.5, 1.0)
+    hull = Hull(np.stack(cells, axis=-1).reshape(-1, 3), 0.5)
     assert mask_iou(along.pixels, silhouette(hull, along)) > 0.95
 
 
@@ -167,7 +167,7 @@ def test_masks_agree_as_well_where_cameras_are_in_the_coordinates_of_a_map():
         there = SimpleNamespace(box=box, ground=ground, sparse=own + at, kind=np.ones(len(own), np.int8))
         scored = score_masks([view.pixels for view in views], there, views, MaskSettings(hull_voxels=80))
         scores.append(list(scored.scores.values()))
-        corners.append(box.corners() - at)
+        corners.append(box.to_object(np.array([box.low, box.high])) - at)
     np.testing.assert_allclose(scores[1], scores[0], atol=0.01)
     np.testing.assert_allclose(corners[1], corners[0], atol=1e-3)
 
