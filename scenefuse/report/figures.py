@@ -183,7 +183,7 @@ def _before_after(name: str, join: Surroundings, clouds: Discs) -> Figure:
             [*_sides(cloud, join.framed, radii, join.has_north), ("from below, surroundings cut away", from_below)]
         )
     labels = ["before", "after" if join.fused else "after (not fused)"]
-    return draw_sheet(f"{name}: before and after", join.decision, rows, labels=labels)
+    return draw_sheet(f"{name}: before and after", f"{join.decision}; grey: from behind", rows, labels=labels)
 
 
 def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.float32]) -> Figure:

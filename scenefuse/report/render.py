@@ -165,7 +165,7 @@ def render(
     """Draw a cloud as (H, W, 3) uint8 RGB.
 
     Args:
-        cloud: N points; normals are used for the head light when there are any.
+        cloud: N points; by their normals, where there are any, they are lit, and grey from behind.
         camera: where from.
         radii: (N,) disc radii in the cloud's unit, or one number for all (`point_radii`).
         colors: (N, 3) uint8, or one RGB, instead of the cloud's own colours; grey where there are none.
@@ -178,7 +178,10 @@ def render(
         height_px=camera.height_px * SUPERSAMPLING,
     )
     chosen = next((given for given in (colors, cloud.colors) if given is not None), (165, 165, 165))
-    rgb = np.broadcast_to(np.asarray(chosen, np.float32), (len(cloud), 3)) * _head_light(cloud, camera)[:, None]
+    facing = _facing(cloud, camera)
+    own = np.broadcast_to(np.asarray(chosen, np.float32), (len(cloud), 3))
+    # Backs are grey: no photo saw them, and in their own colours a facade would show mirrored.
+    rgb = np.where(facing[:, None] < 0, np.float32(190), own) * _head_light(cloud, camera, facing)[:, None]
     pixels, depth = fine.project(cloud.points)
     slopes = _slopes(cloud, fine, pixels)
     radius = np.broadcast_to(np.asarray(radii, dtype=np.float32), (len(cloud),))
@@ -208,17 +211,23 @@ def render(
     return np.clip(picture.reshape(shape).mean((1, 3)) + 0.5, 0, 255).astype(np.uint8)
 
 
-def _head_light(cloud: Cloud, camera: Camera) -> NDArray[np.float32]:
-    """(N,) factor: a lamp left above the camera; surfaces seen from behind get a third of the remaining light less."""
+def _facing(cloud: Cloud, camera: Camera) -> NDArray[np.float32]:
+    """(N,) 1 where a surface is seen from its front, -1 from behind; 1 without normals."""
+    if cloud.normals is None:
+        return np.ones(len(cloud), np.float32)
+    toward = -camera.cam_from_world[2] if camera.orthographic else camera.centre - cloud.points
+    return np.where((toward * cloud.normals).sum(-1) < 0, np.float32(-1), np.float32(1))
+
+
+def _head_light(cloud: Cloud, camera: Camera, facing: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N,) factor: a lamp left above the camera."""
     if cloud.normals is None:
         return np.ones(len(cloud), dtype=np.float32)
     light = 0.35  # by how much a surface seen edge-on is darker
     rotation = camera.cam_from_world.astype(np.float32)
     lamp = rotation.T @ (np.array([-0.35, -0.5, -0.8], dtype=np.float32) / np.float32(1.006))
-    toward = -rotation[2] if camera.orthographic else camera.centre - cloud.points
-    facing = np.sign(np.einsum("ij,ij->i", np.broadcast_to(toward, cloud.points.shape), cloud.normals))
     cosine = np.clip(facing * (cloud.normals @ lamp), 0.0, 1.0)
-    return ((1.0 - light + light * cosine) * np.where(facing < 0, 1.0 - light / 3.0, 1.0)).astype(np.float32)
+    return (1.0 - light + light * cosine).astype(np.float32)
 
 
 def _slopes(cloud: Cloud, camera: Camera, pixels: Array) -> NDArray[np.float32]:
