@@ -161,7 +161,8 @@ def test_of_a_damaged_cloud_that_the_workflow_made_it_is_said_that_it_will_be_ma
 @pytest.mark.parametrize(
     "names",
     ["r,g,b", "R[0-255],G[0-255],B[0-255]", "Rot,Grün,Blau", "rouge,vert,bleu", "rojo,verde,azul", "rgb_r,rgb_g,rgb_b",
-     "diffuse_red,diffuse_green,diffuse_blue", "Color.R,Color.G,Color.B", "scalar_red,scalar_green,scalar_blue"],
+     "RGB:0,RGB:1,RGB:2", "RGBA_0,RGBA_1,RGBA_2", "diffuse_red,diffuse_green,diffuse_blue",
+     "Color.R,Color.G,Color.B", "scalar_red,scalar_green,scalar_blue"],
 )  # fmt: skip
 def test_colours_are_found_by_their_names(tmp_path, names):
     (tmp_path / "a.csv").write_text(f"X[m],Y[m],Z[m],{names}\n" + "\n".join(rows(",", *zip(*COLORS))), "utf-8")

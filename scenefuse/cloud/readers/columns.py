@@ -32,16 +32,16 @@ COLOR_NAMES = (
     {"g", "green", "gf", "grün", "grun", "gruen", "vert", "verde", "groen", "zielony", "gron", "grön", "grønn"},
     {"b", "blue", "bf", "blau", "bleu", "azul", "blu", "blauw", "niebieski", "bla", "blå"},
 )
-# What they call positions and normals; ParaView numbers them.
+# What they call positions and normals; ParaView numbers them, and colours.
 OTHER_NAMES = {name: name for name in (*POSITION, *NORMAL)} | {
     f"{word}{k}": name
-    for words, names in ((("points",), POSITION), (("normals", "normal"), NORMAL))
+    for words, names in ((("points",), POSITION), (("normals", "normal"), NORMAL), (("rgb", "rgba"), COLOR))
     for axis, name in enumerate(names)
     for word in words
     for k in (axis, "xyz"[axis])
 }
 # What may stand before or behind the name of a column: whose colour it is, a unit, a range.
-AROUND = re.compile(r"^(diffuse|colou?r|rgb|scalar|vertex|farbe|couleur)(?=.)|[\[(].*$")
+AROUND = re.compile(r"^(diffuse|colou?r|rgba?+|scalar|vertex|farbe|couleur)(?=\D)|[\[(].*$")
 # What PCL calls colours whose bytes are those of one number, whatever its type.
 PACKED = ("rgb", "rgba")
 # Around the number in a cell: quotes, blanks, and a byte order mark, whole or read as three letters.
