@@ -153,7 +153,8 @@ def is_current(made: Path, source: Path) -> bool:
 
 def has_surface(folder: Path) -> bool:
     """Whether the surface of an object's last fusion is there; that of one that was refused shows the scene alone."""
-    return is_added(folder) and is_current(folder / "surface.json", folder / "fused.ply")
+    whole = all((folder / f"surface.{kind}").is_file() for kind in ("ply", "glb"))  # a person may delete large files
+    return whole and is_added(folder) and is_current(folder / "surface.json", folder / "fused.ply")
 
 
 def surface_facts(folder: Path, row: Row) -> dict[str, str]:

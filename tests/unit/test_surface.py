@@ -29,6 +29,7 @@ from scenefuse.geometry.photo_check import pack
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
 from scenefuse.photos.workspace import View, read_views, write_model
 from scenefuse.report.facts import surface_facts
+from scenefuse.report.view_mesh import read_mesh
 from scenefuse.report.write_pdf import write_pdf
 from scenefuse.surface import drawings as drawn
 from scenefuse.surface import texture, tiles
@@ -803,6 +804,10 @@ def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_int
     assert surface_facts(tmp_path, {}) == {}
     (tmp_path / "fused.ply").touch()
     write_json(tmp_path / "surface.json", surface_report(closed, "m") | {"reason": quantity("", "")})
+    # A mesh that was deleted leaves the page without it, not without a page.
+    for kind in ("ply", "glb"):
+        assert surface_facts(tmp_path, {}) == {} and read_mesh(tmp_path, "m") is None
+        (tmp_path / f"surface.{kind}").touch()
     found = surface_facts(tmp_path, {})["Mesh"]
     assert (
         f"objects/{tmp_path.name}/surface.ply (local frame, metres; for CloudCompare, MeshLab)" in found
