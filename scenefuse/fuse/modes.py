@@ -23,11 +23,11 @@ from scenefuse.fuse.measure import (
     deviations_of_pose,
     measure,
     measure_again,
+    plain_points,
     unchecked,
     with_evidence,
     with_normals,
 )
-from scenefuse.fuse.plain import plain_points
 from scenefuse.fuse.settle import settle
 from scenefuse.fuse.write import GAINS, MIN_PAIRS, SEAM_SPACINGS, Changes, feathered, with_colors_of
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, moved_photos

@@ -1,15 +1,18 @@
 """Maximum likelihood: every scene point is a noisy sample of the object's surface, in place and colour (method R15).
 
 How certain the most likely pose is, and how far it lies off, follows from the scatter of its pieces and from planted
-copies of the scene.
+copies of the scene. What makes any pose uncertain besides is what surfaces have wrong in common, and how far models may
+be bent.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
+from scenefuse.core.stage import threads
 from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3, Uncertainty
 from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, change_between, moved_about, similarity_rows
@@ -26,6 +29,8 @@ MIN_NOISE = 0.75
 PIECES_ACROSS = 6
 # Copies of the scene that are drawn from the object, at a pose that is known.
 PLANTED_COPIES = 4
+# What a surface has wrong alike all over, as a share of how far two surfaces scatter about each other.
+COMMON_ERROR = 0.2
 
 
 @dataclass(frozen=True)
@@ -293,3 +298,47 @@ def _part(surface: Surface, rows: Array) -> Surface:
     points = surface.points[rows]
     colors = None if surface.colors is None else surface.colors[rows]
     return Surface(points, surface.normals[rows], colors, cKDTree(points), np.arange(len(rows)))
+
+
+def with_bending(local: Uncertainty, pose: Sim3, of_object: Array | None, of_scene: Array | None) -> Uncertainty:
+    """A pose's uncertainty against the world, where both models may be bent (method M10).
+
+    Args:
+        local: of the pose between the models as they are, about the object's centre.
+        pose: scene_from_object.
+        of_object: (7, 7) covariance of the object's model around that centre, in its own frame; None where unknown.
+        of_scene: (7, 7) of the scene's model around the same place, in the scene's frame.
+    """
+    total = local.covariance.copy()
+    if of_object is not None:
+        into_scene = block_diag(pose.rotation, pose.scale * pose.rotation, 1.0)
+        total += into_scene @ of_object @ into_scene.T
+    if of_scene is not None:
+        total += of_scene
+    return Uncertainty.of(total)
+
+
+def common_error(obj: Surface, scene: Surface, pose: Sim3, scales: ScaleRange, reach: float) -> Array:
+    """What a pose by clouds has wrong because their surfaces err alike, about the object's centre (method R12).
+
+    Stereo fattens, smooths and displaces whole surfaces; neither their scatter nor halves of them show it. It is taken
+    as a fifth of the scatter: of the RMS distance, along the object's normals, of the scene's points that lie on it.
+
+    Args:
+        obj: the object.
+        scene: the scene.
+        pose: scene_from_object.
+        scales: bounds of the scale; one that is held has no error.
+        reach: distance within which a point of the scene lies on the object, scene units.
+
+    Returns:
+        (7, 7) covariance of rotation vector (radians), translation (scene units) and log scale.
+    """
+    points = pose.inverse().apply(scene.points)
+    distance, nearest = obj.tree.query(points, distance_upper_bound=reach / pose.scale, workers=threads())
+    on_it = np.isfinite(distance)
+    off = ((points[on_it] - obj.points[nearest[on_it]]) * obj.normals[nearest[on_it]]).sum(1)
+    shift = COMMON_ERROR * pose.scale * float(np.sqrt((off**2).mean())) if on_it.any() else 0.0
+    radius = pose.scale * float(np.sqrt(((obj.points - obj.points.mean(0)) ** 2).sum(1).mean()))
+    of_scale = shift / radius if scales.width > 0 else 0.0
+    return np.diag(np.square([shift / radius] * 3 + [shift] * 3 + [of_scale]))

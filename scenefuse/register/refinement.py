@@ -21,7 +21,7 @@ from scenefuse.register.decision import (
     unless_bent,
     unless_mirrored,
 )
-from scenefuse.register.likelihood import certified
+from scenefuse.register.likelihood import certified, common_error, with_bending
 from scenefuse.register.problem import SURFACE_POINTS, Problem
 from scenefuse.register.repetition import multiples, shifted, shifts_onto_itself, undecided_shift
 from scenefuse.register.score import (
@@ -33,7 +33,6 @@ from scenefuse.register.score import (
     displaced_share,
     score,
 )
-from scenefuse.register.uncertainty import common_error, with_bending
 
 # First pairing distance, as a share of the diagonal: of poses that differ by less, one finds the other.
 START_FRACTION = DISTINCT_SHIFT

@@ -15,6 +15,7 @@ from scenefuse.geometry.surface import SAMPLED_POINTS, SCORE_FRACTION
 from scenefuse.photos.pictures import write_picture
 from scenefuse.register.coarse import CoarseSettings, coarse_quantities, hypotheses_or_centres
 from scenefuse.register.decision import FineSettings, tilt_deg
+from scenefuse.register.likelihood import with_bending
 from scenefuse.register.problem import (
     Constraints,
     Inputs,
@@ -28,7 +29,6 @@ from scenefuse.register.problem import (
 )
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.score import Hypothesis
-from scenefuse.register.uncertainty import with_bending
 
 # Photos whose depth maps give the free space; more look from sides that these have seen.
 FREE_SPACE_PHOTOS = 12

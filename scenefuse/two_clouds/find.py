@@ -21,7 +21,7 @@ from scenefuse.geometry.surface import SCORE_FRACTION, with_queries
 from scenefuse.marks.clicks import ScenePoints, read_points
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg
-from scenefuse.register.likelihood import certified
+from scenefuse.register.likelihood import certified, common_error
 from scenefuse.register.problem import (
     SURFACE_POINTS,
     Constraints,
@@ -35,7 +35,6 @@ from scenefuse.register.problem import (
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.register_object import pose_quantities, rests_on
 from scenefuse.register.score import DISTINCT_SHIFT, AgreementSettings, Hypothesis, lead, registration_metrics, score
-from scenefuse.register.uncertainty import common_error
 from scenefuse.two_clouds.places import MAX_PLACES, likely_places
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.

@@ -21,7 +21,7 @@ from scenefuse.core.transforms import Sim3, Uncertainty
 from scenefuse.georef.align_models import AlignmentSettings, align_landmarks
 from scenefuse.georef.spread import Spread, spread_of
 from scenefuse.register.decision import MAX_BENT, FineSettings
-from scenefuse.register.uncertainty import with_bending
+from scenefuse.register.likelihood import with_bending
 
 # As in registration.py.
 SCALE_PCT, ROTATION_DEG, SHIFT_PCT = 2.0, 2.0, 1.0

@@ -11,7 +11,7 @@ from support.surveyed import fly
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3, Uncertainty
 from scenefuse.georef.spread import Spread, read_spread, spread_of, write_spread
-from scenefuse.register.uncertainty import with_bending
+from scenefuse.register.likelihood import with_bending
 from scenefuse.sfm.colmap import adjust
 from scenefuse.sfm.features import read_calibration
 from scenefuse.sfm.lens import BROWN, CENTRED, HELD, RADIAL, choose_lens, enrich

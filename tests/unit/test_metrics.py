@@ -9,16 +9,17 @@ from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import quantity, read_json, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.surface import SAMPLED_POINTS
-from scenefuse.metrics.completion import (
+from scenefuse.metrics.compute_metrics import (
     Completion,
     MetricSettings,
+    box_size,
     completion_metrics,
     completion_of,
+    compute_metrics,
     local_density,
     primitive_fitting_score,
     surface_variation,
 )
-from scenefuse.metrics.compute_metrics import box_size, compute_metrics
 from scenefuse.register.score import registration_metrics, self_consistency
 
 SETTINGS = MetricSettings(

@@ -6,8 +6,7 @@ import pytest
 from scenefuse.cloud.clouds import Cloud, concatenate
 from scenefuse.core.transforms import look_at
 from scenefuse.fuse.compare import compare
-from scenefuse.fuse.measure import Measured
-from scenefuse.fuse.plain import plain_points
+from scenefuse.fuse.measure import Measured, plain_points
 from scenefuse.geometry.photo_check import Matches
 from scenefuse.photos.workspace import View
 

@@ -26,6 +26,7 @@ from scenefuse.register.coarse import (
     upright_candidates,
 )
 from scenefuse.register.decision import FineSettings
+from scenefuse.register.likelihood import COMMON_ERROR, common_error
 from scenefuse.register.problem import (
     Alignment,
     Constraints,
@@ -39,7 +40,6 @@ from scenefuse.register.problem import (
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.register_object import register_object
 from scenefuse.register.score import color_agreement, score
-from scenefuse.register.uncertainty import COMMON_ERROR, common_error
 from scenefuse.two_clouds import find
 
 Z = np.array([0.0, 0.0, 1.0])
