@@ -94,7 +94,7 @@ def compute_metrics(
         fine_json: JSON of the fine registration of this variant.
         fused: the object's fused surroundings (PLY, with `source`); without it completion is left out.
         report: output JSON with `registration`, `object` (its size in the scene: length, width and height; median
-            standard deviations of the added points) and `completion`.
+            and 90 % standard deviations of the added points) and `completion`.
         seed: of samples and of the random clouds that give the null values.
         settings: see MetricSettings.
     """
@@ -115,6 +115,7 @@ def compute_metrics(
             known = after.fields[name][added] if name in after.fields else np.empty(0)
             if np.isfinite(known).any():
                 content["object"][name] = quantity(float(np.nanmedian(known)), unit)
+                content["object"][f"{name}_90"] = quantity(float(np.nanpercentile(known, 90)), unit)
         part = completion_of(scene.points, after, Source.OBJECT, diagonal)
         content["completion"] = completion_metrics(part, settings, seed)
     for group in content.values():

@@ -180,11 +180,12 @@ def surface_facts(folder: Path, row: Row) -> dict[str, str]:
 def accuracies(row: Row) -> list[str]:
     """How exact a scene or an object is, in sentences; the first is the one to quote."""
     has = _known(row)
-    found = [
-        f"{length(has[name], has.get('unit', 'scene units'))} {what}"
-        for name, what in WORDS["deviations"].items()
-        if name in has
-    ]
+    unit, found = has.get("unit", "scene units"), list[str]()
+    for name, what in WORDS["deviations"].items():
+        if name in has:
+            found.append(f"{length(has[name], unit)} {what}")
+            if f"{name}_90" in has:
+                found[-1] += f", at most {length(has[f'{name}_90'], unit)} for nine points in ten"
     if has.get("scale_sd_log"):
         found.append(f"its size beside the scene's is known to {percent(has['scale_sd_log'])}")
     for kind, what in WORDS["errors"].items():

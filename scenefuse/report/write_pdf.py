@@ -54,7 +54,9 @@ def write_pdf(
         if row["status"] not in ADDED:
             continue
         page.pictures([folder / f"figures/{when}.png" for when in ("before", "after")], ["before", "after"])
-        is_drawn = (folder / "drawings/drawings.json").is_file()
+        # A person may delete some of them.
+        drawn = ("drawings.json", *(f"{side}.tif" for side in SIDES))
+        is_drawn = all((folder / "drawings" / name).is_file() for name in drawn)
         page.start(folder.name, "what is missing" + (", and the four sides" if is_drawn else ""))
         if is_drawn:
             page.sides(folder / "drawings")

@@ -140,7 +140,8 @@ def test_a_random_ball_is_no_primitive():
 def test_stage_writes_completion_with_its_nulls(tmp_path):
     rng = np.random.default_rng(0)
     scene, added = (rng.uniform(0, 4, (3000, 3)) * [1, 1, 0] + [x, 0, 0] for x in (0, 4))
-    both = Cloud(np.concatenate([scene, added]), fields={"source": np.repeat([0, 1], 3000).astype(np.uint8)})
+    fields = {"source": np.repeat([0, 1], 3000).astype(np.uint8), "deviation": np.linspace(-1, 1, 6000, dtype="f4")}
+    both = Cloud(np.concatenate([scene, added]), fields=fields)
     write_cloud(tmp_path / "crop.ply", Cloud(scene))
     write_cloud(tmp_path / "object.ply", Cloud(np.concatenate([scene, added])))
     write_cloud(tmp_path / "fused.ply", both)
@@ -160,6 +161,9 @@ def test_stage_writes_completion_with_its_nulls(tmp_path):
     )
     content = read_json(tmp_path / "metrics.json")
     assert content["object"]["size"]["unit"] == "m"
+    # Of the points added alone.
+    assert content["object"]["deviation"] == {"value": pytest.approx(0.5, abs=0.01), "unit": "m"}
+    assert content["object"]["deviation_90"] == {"value": pytest.approx(0.9, abs=0.01), "unit": "m"}
     completion = {name: item["value"] for name, item in content["completion"].items()}
     assert content["registration"]["fitness"]["value"] == 1.0
     assert content["registration"]["tau"]["unit"] == "m"

@@ -898,6 +898,10 @@ def test_four_sides_of_a_small_object_fill_their_place_on_paper_and_no_more(tmp_
     (left, *_, right, _), (beside, *_, end, _), *_ = (image.get_bounds() for image in page.get_objects([3]))
     assert right - left > 200 and right < beside and end < 595
     assert said in page.get_textpage().get_text_bounded()
+    # A drawing that was deleted leaves the report without the four sides, not without the report.
+    (drawings / "east.tif").unlink()
+    write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")
+    assert "four sides" not in pypdfium2.PdfDocument(tmp_path / "r.pdf")[2].get_textpage().get_text_bounded()
 
 
 def test_long_names_do_not_run_off_the_paper(tmp_path: Path):
