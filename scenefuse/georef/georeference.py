@@ -12,7 +12,7 @@ import pycolmap
 from scenefuse.cloud.crs import check_in_area, grid_name, projected_crs
 from scenefuse.cloud.import_cloud import near_origin
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, value, write_json
-from scenefuse.core.transforms import FIXING_POINTS, MAX_DEVIATIONS, Array, Sim3, box_corners, fit_sim3
+from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3, box_corners, fit_sim3
 from scenefuse.georef.control import CHECK, Control, read_control_points
 from scenefuse.georef.on_cloud import lay_on_cloud
 from scenefuse.georef.placement import (
@@ -163,7 +163,7 @@ def georeference(
         StageError: what `place_by_control` and `beside_gps` say; check points of a scene that nothing else places.
     """
     by_gps = settings.use_gps and len(gps.names) >= PHOTOS_OF_ONE_ERROR
-    gps, zeros = of_one_zero(gps, MAX_DEVIATIONS * settings.gps_accuracy_m) if by_gps else (gps, "")
+    gps, zeros = of_one_zero(gps, settings.gps_accuracy_m) if by_gps else (gps, "")
     if control is not None and not control.only_checks:
         positions = np.array([s.point.position for s in control.located])
         frame = replace(local_frame(positions), grid=control.grid)

@@ -86,7 +86,7 @@ class GpsCameras:
     sd_m: Array
 
 
-def of_one_zero(gps: GpsCameras, least_m: float) -> tuple[GpsCameras, str]:
+def of_one_zero(gps: GpsCameras, accuracy_m: float) -> tuple[GpsCameras, str]:
     """GPS heights of flights that count from different zeros, as ellipsoid and sea, brought to that of most photos; and
     what was done, "" for nothing. Such steps turn the model, and residuals hardly show it.
 
@@ -95,13 +95,17 @@ def of_one_zero(gps: GpsCameras, least_m: float) -> tuple[GpsCameras, str]:
 
     Args:
         gps: photos in the order of their names: one flight after the other.
-        least_m: what a step has to exceed, and how far a position that agrees is off at most.
+        accuracy_m: standard error of a position, which a step has to exceed, and the noise from one photo to the next,
+            of which a barometer's heights have little, as far as four of these errors.
     """
     known, few = np.flatnonzero(np.isfinite(gps.positions[:, 2])), PHOTOS_OF_ONE_ERROR
     if len(known) < 4 * few:
         return gps, ""
     heights, order, starts = gps.positions[known, 2], np.arange(len(known)), np.arange(few, len(known) - few + 1)
     linear, steps = np.c_[gps.centres[known], np.ones(len(known))], np.zeros(0, dtype=np.int64)
+    apart_m = np.abs(np.diff(heights - linear @ np.linalg.lstsq(linear, heights)[0]))
+    noise_m = MAX_DEVIATIONS * SD_OVER_MEDIAN * np.median(apart_m) / np.sqrt(2)
+    least_m = float(np.clip(noise_m, accuracy_m, MAX_DEVIATIONS * accuracy_m))
     best, note, least = gps, "", _disagreeing(gps, least_m)
     # A day has no more flights.
     while least > few and len(starts) and len(steps) < 10:
