@@ -308,11 +308,37 @@ def render(
     Returns:
         (H, W, 3) light and (H, W, S) owners.
     """
-    height, width = cameras.height, cameras.width
-    samples = len(in_cam) // (height * width)
     rays = np.empty((len(in_cam), 6), dtype=np.float32)
     world_from_cam = np.ascontiguousarray(cameras.cam_from_world[photo].T)
     textures.world_rays(rays, cameras.centres[photo], world_from_cam, in_cam)
+    shape = cameras.height, cameras.width
+    light, owners, _ = light_of(world, rays, shape, open_sky, 1.0 / cameras.intrinsics[0, 0], haze)
+    return light, owners
+
+
+def light_of(
+    world: World,
+    rays: NDArray[np.float32],
+    shape: tuple[int, int],
+    open_sky: NDArray[np.float32],
+    pixel_angle: float,
+    haze: float,
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float32]]:
+    """What rays (H * W * S, 6) of a picture of a shape (H, W) meet, S of a pixel next to each other.
+
+    Args:
+        world: what is shown.
+        rays: origins and unit directions.
+        shape: of the picture.
+        open_sky: (V,) of `demo.world.openness`.
+        pixel_angle: radians that a pixel covers.
+        haze: share of white in the sky.
+
+    Returns:
+        (H, W, 3) linear light, and (H, W, S) owners, -1 for the sky, and distances in metres.
+    """
+    height, width = shape
+    samples = len(rays) // (height * width)
     hits = world.scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=threads())
     distance, normals, uv = (hits[key].numpy() for key in ("t_hit", "primitive_normals", "primitive_uvs"))
     triangle = hits["primitive_ids"].numpy().view(np.int32)
@@ -325,10 +351,10 @@ def render(
     light = np.empty((height, width, 3))
     textures.shade(
         light, rays, distance, normals, triangle, uv, lit, world.materials, world.owners, world.triangles,
-        open_sky, world.frames, SUN, 1.0 / cameras.intrinsics[0, 0], haze,
+        open_sky, world.frames, SUN, pixel_angle, haze,
     )  # fmt: skip
     owners = np.where(triangle >= 0, world.owners[np.maximum(triangle, 0)], -1)
-    return light, owners.reshape(height, width, samples)
+    return light, owners.reshape(height, width, samples), distance.reshape(height, width, samples)
 
 
 def _sun_disc(samples: int) -> NDArray[np.float64]:
