@@ -1,5 +1,6 @@
 """What a run will take: time, memory and disk space, forecast before its first job."""
 
+import contextlib
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -242,10 +243,12 @@ def seconds_left(forecast: Mapping[str, float], folder: Path, started: float, co
     taken, done = 0.0, 0.0
     for name, seconds in forecast.items():
         file = folder / name
-        if file.is_file() and file.stat().st_mtime >= started:
-            # Snakemake measures nothing of a job of less than a moment.
-            taken += float(pd.to_numeric(pd.read_csv(file, sep="\t")["cpu_time"], errors="coerce").fillna(0).sum())
-            done += seconds
+        # While Snakemake writes it, a file is empty.
+        with contextlib.suppress(OSError, ValueError, KeyError):
+            if file.stat().st_mtime >= started:
+                # Snakemake measures nothing of a job of less than a moment.
+                taken += float(pd.to_numeric(pd.read_csv(file, sep="\t")["cpu_time"], errors="coerce").fillna(0).sum())
+                done += seconds
     total = sum(forecast.values())
     # What is left takes longer than forecast, as what is done did; the more is done, the more is known of that.
     slower = (taken + total - done) / total if total else 1.0

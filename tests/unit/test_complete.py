@@ -309,6 +309,7 @@ def test_the_time_left_follows_what_jobs_took_so_far(tmp_path):
     for name in "ab":
         (tmp_path / f"{name}.tsv").write_text("s\tcpu_time\n9\t300\n")
     os.utime(tmp_path / "b.tsv", (50, 50))  # of a run before
+    (tmp_path / "c.tsv").touch()  # being written
     # One of four is done and took three times its forecast, so that all takes half as long again.
     assert seconds_left(forecast, tmp_path, 100, 2) == pytest.approx(1.15 * 1.5 * 300 / 2)
 
