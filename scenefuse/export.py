@@ -51,8 +51,8 @@ def export(arguments: list[str], settings_files: list[Path]) -> int:
         if len(names) != 1:
             sys.exit("error: --facade is of one object; name it by --object")
         # Once they are kept, every export draws them.
-        if along_a_line(np.reshape(words.facade, (3, 3))):
-            sys.exit("error: the three points of --facade lie in a line; click three of its corners")
+        if not np.isfinite(words.facade).all() or along_a_line(np.reshape(words.facade, (3, 3))):
+            sys.exit("error: the three points of --facade lie in a line or are no numbers; click three of its corners")
         Path(f"results/objects/{names[0]}/facade.txt").write_text(" ".join(map(str, words.facade)))
     scenes = sorted(name for name in project.scenes if Path(f"results/scenes/{name}/dense.ply").is_file())
     # Given clouds have no cameras, and a scene that was not completed has no tiles.
@@ -137,7 +137,17 @@ def write_zip(page: Path, exported: Iterable[Path], file: Path) -> None:
     results, text = page.parent.parent, page.read_text(encoding="utf-8")
     given = {*exported, *(results / link for link in re.findall(r'href="\.\./([^"#]+)"', text))}
     files = {path for top in given for path in (top, *top.rglob("*")) if path.is_file() and path.name[0] != "."}
-    with atomic_file(file) as temporary, ZipFile(temporary, "w", ZIP_DEFLATED, compresslevel=1) as archive:
+    with (
+        atomic_file(file) as temporary,
+        ZipFile(
+            # A copy may have lost its files' dates.
+            temporary,
+            "w",
+            ZIP_DEFLATED,
+            compresslevel=1,
+            strict_timestamps=False,
+        ) as archive,
+    ):
         archive.writestr(page.name, text.replace('href="../', 'href="').replace(">results/", ">"))
         for path in sorted(files):
             # What belongs to the summary lies at the top, beside the page.

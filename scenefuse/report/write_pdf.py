@@ -46,7 +46,7 @@ def write_pdf(
     found = [[each.get("Size", "-"), surface] for each, surface in zip(facts, surfaces)]
     page.rows([[folder.name, verdict(row), *more] for folder, row, more in zip(objects, rows, found)], (3, 3, 7, 12))
     for folder in scenes:
-        page.pictures([folder / "scene.png"], [f"scene {folder.name} and its cameras"])
+        page.pictures([folder / "scene.png"], [f"scene {folder.name}"])
     for folder, row, each in zip(objects, rows, facts):
         page.start(folder.name, page.made)
         page.facts(each)
@@ -57,10 +57,14 @@ def write_pdf(
         # A person may delete some of them.
         drawn = ("drawings.json", *(f"{side}.tif" for side in SIDES))
         is_drawn = all((folder / "drawings" / name).is_file() for name in drawn)
-        page.start(folder.name, "what is missing" + (", and the four sides" if is_drawn else ""))
+        # Without photos nothing says what is missing.
+        missing = folder / "figures/missing.png"
+        shown = ["what is missing"] * missing.is_file() + ["the four sides"] * is_drawn
+        if shown:
+            page.start(folder.name, ", and ".join(shown))
         if is_drawn:
             page.sides(folder / "drawings")
-        page.pictures([folder / "figures/missing.png"], ["what is missing, and from where photos would show it"])
+        page.pictures([missing], ["what is missing, and from where photos would show it"])
     with atomic_file(report) as temporary:
         page.output(str(temporary))
 
