@@ -50,7 +50,8 @@ def object_facts(row: Row) -> dict[str, str]:
     unit, status = has.get("unit", "scene units"), has["status"]
     why = has.get("reason") if status == "unregistered" else has.get("error")
     if status in DONE:
-        why = WORDS["decided_by"].get(has.get("decided_by", ""))
+        # The pose of an ungated one is the clouds', whether photos link it or not.
+        why = WORDS["decided_by"].get(has.get("decided_by", "")) if status == "registered" else None
     facts["Result"] = WORDS["results"][status] + _completed(has) + _of_shown(has) + (f": {why}" if why else "")
     if status == "unregistered":
         facts["Result"] += ". Perhaps it is not in this scene, or too little of it"
@@ -279,13 +280,20 @@ def rows_of(summary: Path, kind: str, folders: Sequence[Path]) -> list[dict[str,
     return [known.get(folder.name, {kind: folder.name, **missing}) for folder in folders]
 
 
-def made_by(summary: Path) -> str:
-    """By what, when and, if scenes.tsv says so, by whom the results were made."""
-    file = summary / "scenes.tsv"
-    day = date.fromtimestamp(file.stat().st_mtime) if file.is_file() else date.today()
-    who = dict.fromkeys(filter(None, (_known(row).get("made_by") for row in records(read_table(file)))))
+def made_today(summary: Path) -> str:
+    """By what, today and, if scenes.tsv says so, by whom the results were made."""
+    rows = records(read_table(summary / "scenes.tsv"))
+    who = dict.fromkeys(filter(None, (_known(row).get("made_by") for row in rows)))
     by = f" by {', '.join(who)}" if who else ""
-    return f"Made with scenefuse {VERSION} on {day}{by}."
+    return f"Made with scenefuse {VERSION} on {date.today()}{by}."
+
+
+def made_by(summary: Path) -> str:
+    """What summary.txt says of that: results may be exported later, by another version, from a copy."""
+    file = summary / "summary.txt"
+    text = file.read_text() if file.is_file() else ""
+    said = re.search(r"^Made with .+?(?=\ndetails\.txt )", text, re.DOTALL | re.MULTILINE)
+    return " ".join(said[0].split()) if said else made_today(summary)
 
 
 def title_of(objects: Sequence[Path]) -> str:

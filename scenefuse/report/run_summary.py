@@ -276,4 +276,4 @@ def _in_unit(fields: Fields, unit: str) -> Fields:
 
 def why_missing(failed: str) -> str:
     """Why something is missing, for the reader: the failure, or that nothing of it ran."""
-    return failed or "no error in its logs; it has not run yet"
+    return failed or "no error in its logs; it has not run to its end"

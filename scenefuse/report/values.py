@@ -79,7 +79,7 @@ def number(item: Any) -> str:
     if isinstance(item, float):
         if not math.isfinite(item):
             return "-"
-        return f"{item:.4g}" if abs(item) < 1e4 else f"{item:.0f}"
+        return f"{item:.4g}" if abs(item) < 9999.5 else f"{item:.0f}"
     return "-" if item is None or item == "" else str(item)
 
 

@@ -69,7 +69,8 @@ def write_report(
     shown = list(zip(objects, rows_of(summary, "object", objects)))
     flown = list(zip(scenes, rows_of(summary, "scene", scenes)))
     links = "".join(
-        f'<span><a href="#{escape(folder.name)}">{escape(folder.name)}</a>{_badge(row)}</span>' for folder, row in shown
+        f'<span><a href="#object-{escape(folder.name)}">{escape(folder.name)}</a>{_badge(row)}</span>'
+        for folder, row in shown
     )
     body = [
         f"<header><h1>{escape(title)}</h1><p>{escape(made_by(summary))} {texts['intro']}</p>",
@@ -125,7 +126,7 @@ def _folded(title: str, content: str) -> str:
 def _object_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str:
     """One object: result, picture before and after, facts, 3D view, what is missing, masks."""
     status = row["status"]
-    parts = [f'<section class="card" id="{escape(folder.name)}"><h2>{escape(folder.name)}{_badge(row)}</h2>']
+    parts = [f'<section class="card" id="object-{escape(folder.name)}"><h2>{escape(folder.name)}{_badge(row)}</h2>']
     is_finished, figures = status not in UNFINISHED, folder / "figures"
     pictures = [_slider(figures)] if status in ADDED and (figures / "before.png").is_file() else []
     facts = object_facts(row) | (surface_facts(folder, row) if is_finished else {})
@@ -163,7 +164,9 @@ def _scene_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str:
     parts = [f'<section class="card" id="scene-{escape(folder.name)}"><h2>Scene {escape(folder.name)} in pictures</h2>']
     if view is not None:
         parts.append(view_section(f"scene-{folder.name}", f"scene {folder.name}", view, scale_sd=scale_sd(row)))
-    return "\n".join([*parts, figure(folder / "scene.png", texts["scene_figure"]), "</section>"])
+    # A given cloud has no cameras to show.
+    caption = texts["scene_figure" if pd.notna(row.get("registered")) else "cloud_figure"]
+    return "\n".join([*parts, figure(folder / "scene.png", caption), "</section>"])
 
 
 def _object_record(folder: Path, texts: Texts) -> str:

@@ -19,7 +19,7 @@ from scenefuse.report.facts import (
     accuracies,
     diagnose,
     is_current,
-    made_by,
+    made_today,
     object_facts,
     of_cameras,
     photographed,
@@ -68,7 +68,7 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
     for name, table in tables.items():
         with atomic_file(summary / f"{name}.tsv") as temporary:
             table.to_csv(temporary, sep="\t", index=False, na_rep="-", float_format="%.10g")
-    texts = {"details": details_text(found, tables), "summary": summary_text(found, tables, made_by(summary))}
+    texts = {"details": details_text(found, tables), "summary": summary_text(found, tables, made_today(summary))}
     for name, text in texts.items():
         with atomic_file(summary / f"{name}.txt") as temporary:
             temporary.write_text(text)

@@ -208,7 +208,7 @@ def test_a_variant_that_did_not_run_and_a_measure_of_nothing_are_said(folder):
     assert table.loc[("house", 2, "full", "inlier_rmse"), "note"] == f"{HERE}: no point of the object within tau"
     assert table.loc[("house", 3, "full", "nue"), "note"].startswith(f"{HERE}: too few points were added")
     assert set(table.loc[("house", 4, "no_crop"), "note"]) == {
-        f"{HERE}: missing, no error in its logs; it has not run yet"
+        f"{HERE}: missing, no error in its logs; it has not run to its end"
     }
     assert table.loc[("house", 4, "no_scale"), "note"].isna().all()
 

@@ -488,6 +488,7 @@ def test_a_length_is_as_exact_in_the_scene_s_view_as_its_scale(tmp_path):
     (tmp_path / "summary/scenes.tsv").write_text("scene\tgps_scale_sd_log\nyard\t0.03\n")
     write_report(summary=tmp_path / "summary", scenes=(yard,), title="test", report=page)
     assert json.loads(re.search(r'class="about">(.*?)</script>', page.read_text())[1])["scale_sd"] == 0.03
+    assert "Objects boxed." in page.read_text() and "Cameras red" not in page.read_text()  # a given cloud has none
 
 
 @pytest.mark.slow

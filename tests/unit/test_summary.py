@@ -13,7 +13,16 @@ from PIL import Image
 
 from scenefuse.core.job_records import KILLED, NO_LOG, NOT_ACCEPTED, JobRecords, why_ended, why_unfinished
 from scenefuse.core.stage import StageError, quantity, write_json
-from scenefuse.report.facts import accuracies, closing_lines, object_facts, photographed, scene_facts, title_of, verdict
+from scenefuse.report.facts import (
+    accuracies,
+    closing_lines,
+    made_by,
+    object_facts,
+    photographed,
+    scene_facts,
+    title_of,
+    verdict,
+)
 from scenefuse.report.run_summary import RunInputs
 from scenefuse.report.values import find, flatten, length, load, number, percent, percents, read_table, records
 from scenefuse.report.write_report import write_report
@@ -345,7 +354,10 @@ def test_an_empty_run_is_a_summary_too(tmp_path):
     )
     write_summary(run=run, summary=tmp_path / "summary")
     text = (tmp_path / "summary/details.txt").read_text()
-    assert "Not run yet" in text and "forecast" not in text
+    assert (
+        "Not finished: no error in its logs; it has not run to its end" in " ".join(text.split())
+        and "forecast" not in text
+    )
     assert len((tmp_path / "summary/completion.tsv").read_text().splitlines()) == 1
 
 
@@ -381,7 +393,7 @@ def test_a_killed_job_is_named_with_its_log(results):
     (results / "benchmarks/make_masks/barn.tsv").write_text(f"{HEADER}1\t0:01:00\t1\t1\t1\t1\t0\t0\t99\t1\n")
     summary = summarise(results, ["barn"])
     text = " ".join((summary / "details.txt").read_text().split())
-    assert "object barn: failed" in text and "Not run yet" not in text
+    assert "object barn: failed" in text and "has not run" not in text
     assert "or a higher memory limit [estimate_depth_prior/barn.log]" in text
     assert read(summary, "registration").set_index(["object", "variant"]).loc[("barn", "full"), "status"] == "failed"
 
@@ -428,11 +440,13 @@ def test_jobs_that_failed_are_listed_even_if_all_results_are_there(results):
 
 def test_a_pose_that_nothing_checked_is_shown_as_such(results):
     fine = {"status": quantity("ungated", ""), "reason": quantity("", ""), "scale": quantity(3.0, "")}
+    fine |= {"decided_by": quantity("geometry", "")}
     for name, variant in (("house", "paper"), ("balloon", "full")):
         write_json(results / f"objects/{name}/registration/{variant}/fine.json", fine)
     summary = summarise(results, ["house", "balloon"])
     text = (summary / "details.txt").read_text()
     assert re.search(r"paper +ungated", text) and "object balloon: ungated" in text
+    assert "for no photos link" not in text
     assert "1 of 2 objects registered and fused, 1 fused without a check of the pose" in text
     table = read(summary, "registration").set_index(["object", "variant"])
     assert table.loc[("house", "paper"), "status"] == table.loc[("balloon", "full"), "status"] == "ungated"
@@ -461,10 +475,11 @@ def test_values():
     fields = flatten({"a": {"b": quantity(1.5, "m"), "c": {"d": quantity("x", "")}}, "note": "left out"})
     assert fields == {"a.b": {"value": 1.5, "unit": "m"}, "a.c.d": {"value": "x", "unit": ""}}
     assert find(fields, "nothing", "a.b") == 1.5 and find(fields, "b") is None
-    assert [number(v) for v in (None, float("nan"), 0.123456, 123456.7, 3, True)] == [
+    assert [number(v) for v in (None, float("nan"), 0.123456, 9999.6, 123456.7, 3, True)] == [
         "-",
         "-",
         "0.1235",
+        "10000",
         "123457",
         "3",
         "yes",
@@ -498,12 +513,21 @@ def test_the_page_is_offline_and_escapes_text(results):
     assert "no &lt;mask&gt; matches a frame" in page and "<mask>" not in page
     assert not re.search(r"https?://|<link|src=\"(?!data:)|url\(", page)
     assert page.count("data:image/webp;base64,") == 3
-    assert 'class="slider"' in page and "its stages" not in page.split('id="house"')[1].split("<section")[0]
+    assert 'class="slider"' in page and "its stages" not in page.split('id="object-house"')[1].split("<section")[0]
 
 
 def test_the_page_names_the_completed_scene_once_every_object_has_a_decision(results):
     page = report(results, ["house", "balloon"])
     assert "completed.copc.laz" in page and "Completed with house; 5,030 points" in page
+
+
+@pytest.mark.parametrize("name", ["record", "k3d"])
+def test_an_object_may_be_called_as_a_part_of_the_page_is(results, name):
+    page = results / "report.html"
+    write_report(summary=summarise(results), objects=[results / "objects" / name], report=page)
+    text = page.read_text()
+    assert f'href="#object-{name}"' in text and text.count(f'id="object-{name}"') == 1
+    assert text.count(f'id="{name}"') == (name == "record")
 
 
 def test_the_page_names_objects_without_figures(results):
@@ -525,7 +549,7 @@ def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
     text = (results / "summary/summary.txt").read_text()
     assert len(text.splitlines()) < 45 and max(map(len, text.splitlines())) <= 100
     assert "% measured" not in text + page.split('id="record"')[0]
-    card = page.split('id="house"')[1].split("<section")[0]
+    card = page.split('id="object-house"')[1].split("<section")[0]
     link = '<a href="../objects/house/next_photos.csv">results/objects/house/next_photos.csv</a>'
     assert link in card.replace("<wbr>", "")
     card = re.sub("<.+?>", "", card).replace("\u00a0", " ")
@@ -619,6 +643,10 @@ def test_an_object_says_when_it_was_photographed_and_how_its_lengths_follow_from
     assert re.search(r"Scale +Trust it to 0\.5 %, 50\.0 mm on a 10 m wall \(standard deviation\)\n", text)
     assert re.search(r"Scale +Trust it to 0\.4 %, 40\.0 mm on a 10 m wall .*, by the photos' GPS\n", text)
     assert re.search(r"Made with scenefuse [\d.]+ on 20\d\d-\d\d-\d\d by Hof Müller", text)
+    summary = results / "summary/summary.txt"
+    text = text.replace("by Hof Müller", "by Hof Müller, Dr.\nBauer").replace(" on 20", " on 19")
+    summary.write_text(text)  # exported much later, from a copy with other dates
+    assert re.fullmatch(r"Made with scenefuse [\d.]+ on 19\S+ by Hof Müller, Dr. Bauer\.", made_by(summary.parent))
     # Where control points or a cloud hold the scene, its GPS does not say how well its lengths are known.
     for more in ({"control_points": quantity(5, "1")}, {"met_share": quantity(0.7, "1")}):
         write_json(scene / "georeference.json", here | more)
