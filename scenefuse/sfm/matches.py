@@ -103,6 +103,8 @@ def match_features(
     pycolmap.set_random_seed(seed)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
+    # What is burned into photos, a date or a drone's display, stays where it is and holds cameras together.
+    verification.filter_stationary_matches = True
     sift = pycolmap.SiftMatchingOptions(max_ratio=settings.max_ratio, max_distance=MAX_DISTANCE, cross_check=True)
     with pycolmap.Database.open(features) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}

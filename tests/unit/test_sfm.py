@@ -549,6 +549,20 @@ def test_photos_of_low_contrast_have_features_too(capture, tmp_path):
     assert value(mapped(tmp_path), "registered") == 6
 
 
+def test_what_is_burned_into_photos_of_different_things_makes_no_pair(tmp_path):
+    (tmp_path / "photos").mkdir()
+    display, *things = (
+        np.clip(gaussian_filter(np.random.default_rng(k).normal(128, 250, (240, 320)), 2), 0, 255).astype(np.uint8)
+        for k in range(4)
+    )
+    for index, thing in enumerate(things):
+        thing[:24], thing[-24:] = display[:24], display[-24:]
+        Image.fromarray(thing).save(tmp_path / "photos" / f"{index}.png")
+    features_of(tmp_path)
+    with pytest.raises(StageError, match="none of the 3 pairs .* show the same thing"):
+        matches_of(tmp_path)
+
+
 def test_a_portrait_photo_of_a_scene_has_a_portrait_camera(tmp_path):
     (tmp_path / "photos").mkdir()
     noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
