@@ -36,6 +36,8 @@ def export(arguments: list[str], settings_files: list[Path]) -> int:
         settings_files: of the project.
     """
     words, others = _parse(arguments)
+    if any(word.startswith(("-d", "--directory")) for word in others):
+        sys.exit("error: --directory is for scenefuse run; go to the folder of the project, and export there")
     try:
         project = read_project(read_settings(*settings_files))
     except StageError as error:
@@ -98,8 +100,9 @@ def _added(named: list[str] | None, project: Project) -> list[str]:
     refused = [name for name in sorted(folders.keys() - {*missing}) if not is_added(folders[name])]
     if refused and named:
         sys.exit(f"error: {refused[0]} was not added to the scene, so there is no surface of it; {SUMMARY} says why")
-    if refused:
-        print(f"Left out: {', '.join(refused)}, not added to the scene; {SUMMARY} says why", flush=True)
+    for left_out, why in ((refused, "not added to the scene"), (missing, "not finished, or in no scene")):
+        if left_out:
+            print(f"Left out: {', '.join(left_out)}, {why}; {SUMMARY} says why", flush=True)
     return sorted(folders.keys() - {*missing, *refused})
 
 

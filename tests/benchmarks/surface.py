@@ -202,8 +202,7 @@ def row(results: Path, name: str, world: World, open_sky: np.ndarray) -> dict[st
             f"{100 * scores[1][at]['recall']:.1f}" for at in ("05pct", "1pct")
         ),
         "bridged area within 1 % (%)": f"{100 * (error <= 0.01).mean():.1f}",
-        "elevations: edges off; picture off, median; 90 % (px)": f"{median_and_90(edges)}; "
-        + median_and_90(shifts),
+        "elevations: edges off; picture off, median; 90 % (px)": f"{median_and_90(edges)}; " + median_and_90(shifts),
         "held-out PSNR in the mask, texture; NeRF (dB)": "; ".join(f"{dB:.1f}" for dB in in_mask[:2]),
         "the same on the object's front; its share (%)": "; ".join(f"{number:.1f}" for number in on_object),
         "processor time, mesh; texture (s)": f"{mesh_s:.0f}; {texture_s:.0f}",

@@ -727,7 +727,7 @@ def test_export_asks_for_finished_objects_and_says_where_they_are(tmp_path: Path
 
 def test_export_makes_no_surface_of_an_object_that_was_not_added(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    write_tables(["yard"], ["barn", "shed"])
+    write_tables(["yard"], ["barn", "shed", "mill"])
     for name, status in (("barn", "fused"), ("shed", "unregistered")):
         write_json(tmp_path / f"results/objects/{name}/fusion.json", {"status": quantity(status, "")})
         (tmp_path / f"results/objects/{name}/fused.ply").touch()
@@ -746,7 +746,9 @@ def test_export_makes_no_surface_of_an_object_that_was_not_added(tmp_path: Path,
 
     of_all = {"scenes/yard/tiles", "summary/report.pdf"}
     assert export() == {"objects/barn/surface.glb", "objects/barn/drawings", *of_all}
-    assert "Left out: shed, not added to the scene; results/summary/summary.txt says why" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "Left out: shed, not added to the scene; results/summary/summary.txt says why" in said
+    assert "Left out: mill, not finished, or in no scene; results/summary/summary.txt says why" in said
     write_tables(["yard"], ["shed"])
     assert export() == of_all
     for words, sentence in (
@@ -755,6 +757,7 @@ def test_export_makes_no_surface_of_an_object_that_was_not_added(tmp_path: Path,
             "shed was not added to the scene, so there is no surface of it; results/summary/summary",
         ),
         (["--object", "shad"], "unknown object 'shad'; config/objects.tsv lists: shed"),
+        (["-d", "elsewhere"], "go to the folder of the project, and export there"),
         (["--what", "surface"], "there is nothing to export as surface; results/summary/summary.txt says"),
     ):
         monkeypatch.setattr(sys, "argv", ["scenefuse", "export", *words])
