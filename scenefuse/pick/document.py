@@ -94,7 +94,7 @@ def with_length(rows: Rows, text: str) -> tuple[Rows, tuple[str, str]]:
     name, _, number = text.strip().removesuffix("m").strip().rpartition(" ")
     try:
         metres = float(number.replace(",", "."))
-        if not 0 < metres < float("inf"):
+        if not (name and 0 < metres < float("inf")):
             raise ValueError
     except ValueError:
         raise StageError("write a name and a length in metres: bar 1.5") from None
