@@ -5,10 +5,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+import tyro
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -97,6 +98,7 @@ def train_object_nerf(
     settings: NerfSettings,
     hold_out_every: int,
     seed: int,
+    add: Annotated[Callable[[Nerf, PhotoTensors], Additions] | None, tyro.conf.Suppress] = None,
 ) -> None:
     """Train a NeRF of one object and render depth, normals and confidence for every photo.
 
@@ -112,25 +114,12 @@ def train_object_nerf(
         settings: of field, training and maps.
         hold_out_every: every n-th photo is not trained on and measures quality; 0 holds out none.
         seed: of the weights and of every random draw.
+        add: what another recipe adds to the training of these photos.
 
     Raises:
         StageError: no masks, an empty visual hull, CUDA asked for and missing, a training that diverged, or no
             surface found.
     """
-    train_stage(inputs, stage, report, checkpoints, settings, hold_out_every, seed)
-
-
-def train_stage(
-    inputs: NerfInputs,
-    stage: Path,
-    report: Path,
-    checkpoints: Path,
-    settings: NerfSettings,
-    hold_out_every: int,
-    seed: int,
-    add: Callable[[Nerf, PhotoTensors], Additions] | None = None,
-) -> None:
-    """`train_object_nerf`, with what another recipe adds to the training of its photos, or nothing."""
     start = time.monotonic()
     device = prepare_device(settings.device)
     given = _read(inputs, settings, hold_out_every)

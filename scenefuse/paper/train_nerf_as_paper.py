@@ -7,6 +7,7 @@ a NeRF's training the paper adds the order of depths, and longer steps of the ha
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -16,7 +17,7 @@ from scenefuse.core.stage import quantity, read_json, write_json
 from scenefuse.core.transforms import DEPTH_JUMP
 from scenefuse.nerf.field import Field, FieldSettings, encode
 from scenefuse.nerf.rays import DEPTH_DELTA, SOLID_OPACITY, LossWeights, PhotoTensors, dilate
-from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, prepare_device, train_stage
+from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, prepare_device, train_object_nerf
 from scenefuse.nerf.training import OCCUPANCY_EVERY, Nerf, NerfRecipe, Rendered, Schedule
 from scenefuse.paper.network_training import LEARNING_RATE, Recipe
 from scenefuse.photos.views import load_views
@@ -183,9 +184,11 @@ def train_nerf_as_paper(
     letter = rays_of_an_epoch(workspace, masks, settings.width_px, hold_out_every)
     drawn = as_paper(settings, letter, device)
     print(f"{drawn.schedule.rays_per_epoch} rays an epoch are drawn, of the paper's {letter}", flush=True)
-    train_stage(
-        NerfInputs(workspace, masks, prior), stage, report, checkpoints, drawn, hold_out_every, seed, order_and_edges
-    )
+    train_object_nerf(
+        inputs=NerfInputs(workspace, masks, prior), stage=stage, report=report, checkpoints=checkpoints,
+        settings=drawn, hold_out_every=hold_out_every, seed=seed,
+        add=partial(OrderAndEdges, images=NERF.images_per_batch),
+    )  # fmt: skip
     content = read_json(report) | {
         "rays_per_epoch": quantity(drawn.schedule.rays_per_epoch, "1"),
         "rays_per_epoch_paper": quantity(letter, "1"),
@@ -201,11 +204,6 @@ def as_paper(settings: NerfSettings, letter: int, device: str) -> NerfSettings:
         field, rays = FIELD, letter
     schedule = Schedule(settings.schedule.epochs, rays)
     return replace(settings, field=field, schedule=schedule, recipe=NERF, losses=LossWeights())
-
-
-def order_and_edges(nerf: Nerf, photos: PhotoTensors) -> OrderAndEdges:
-    """What the paper adds to the training."""
-    return OrderAndEdges(nerf, photos, NERF.images_per_batch)
 
 
 def rays_of_an_epoch(workspace: Path, masks: Path, width_px: int, hold_out_every: int) -> int:

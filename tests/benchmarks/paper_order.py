@@ -10,7 +10,7 @@ from pathlib import Path
 
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import read_json, run, value
-from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_stage
+from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.paper.train_nerf_as_paper import NERF, RANK_WEIGHT, OrderAndEdges, as_paper, rays_of_an_epoch
 
 # So small a weight teaches nothing, and the loss is still measured.
@@ -46,10 +46,11 @@ def paper_order(
             for weight in weights:
                 with tempfile.TemporaryDirectory() as temporary:
                     report = Path(temporary) / "stage2.json"
-                    train_stage(
-                        NerfInputs(workspace, masks, folder / "stage1"), report.with_suffix(""), report,
-                        Path(temporary) / "checkpoints", preset, own["hold_out_every"], seed,
-                        partial(OrderAndEdges, images=NERF.images_per_batch, rank_weight=weight),
+                    train_object_nerf(
+                        inputs=NerfInputs(workspace, masks, folder / "stage1"), stage=report.with_suffix(""),
+                        report=report, checkpoints=Path(temporary) / "checkpoints", settings=preset,
+                        hold_out_every=own["hold_out_every"], seed=seed,
+                        add=partial(OrderAndEdges, images=NERF.images_per_batch, rank_weight=weight),
                     )  # fmt: skip
                     cells = [f"{value(read_json(report), measure):.4g}" for measure in MEASURES]
                 print(f"| {name} | {weight:g} | {seed} | " + " | ".join(cells) + " |", flush=True)
