@@ -106,17 +106,18 @@ def crop_of(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tu
         cut = whole(near)
         print(cut.notes[0], flush=True)
         return near, cut, Marks("none", np.zeros((0, 3)))
-    if settings.mode == "masks" and alignment is not None:
-        if found or inputs.fiducials is None:
-            return crop_linked(scene, inputs, settings)
-        near, cut, marks = crop_by_file(scene, inputs, settings)
+    linked = settings.mode == "masks" and alignment is not None
+    if linked and (found or inputs.fiducials is None):
+        return crop_linked(scene, inputs, settings)
+    near, cut, marks = crop_by_file(scene, inputs, settings)
+    if alignment is not None and linked:
         note = (
             f"marked by {inputs.fiducials}: shared features give no alignment of the object with the scene"
             f" ({value(alignment, 'reason')})"
         )
         print(note, flush=True)
-        return near, replace(cut, notes=[note, *cut.notes]), marks
-    return crop_by_file(scene, inputs, settings)
+        cut = replace(cut, notes=[note, *cut.notes])
+    return near, cut, marks
 
 
 def around_marks(marks: Array, settings: CropSettings, extents: float = 1.0) -> tuple[Array, Array]:
@@ -139,7 +140,7 @@ def crop_by_file(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) 
         return near, crop_marked(near, names, points, UP, settings, inputs.fiducials), Marks("fiducials", points)
     # The crop grows, and looks for ground around what it has become.
     near = scene.near(*around_marks(points, settings, 2 * MAX_GROWTH))[1]
-    cut = crop_grown(near, points, UP, replace(settings, minimal=False), clicks.other(near.points))
+    cut = crop_grown(near, points, replace(settings, minimal=False), clicks.other(near.points))
     cut = replace(cut, notes=[*clicks.left_out, *cut.notes])
     _announce(cut, str(inputs.fiducials))
     return near, cut, Marks("clicks", points)
@@ -209,11 +210,12 @@ def crop_linked(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -
         assert inputs.workspace is not None and inputs.masks is not None
         mode, source, by = "masks", inputs.masks, f"the votes of {inputs.masks}"
         masked = read_masked_views(inputs.workspace, inputs.masks, settings.min_votes)
-        (low, high), sight = around_marks(pose.apply(masked.own), settings), masked.sight(pose)
+        own, sight = pose.apply(masked.own), masked.sight(pose)
+        low, high = around_marks(own, settings)
         near = scene.near(np.minimum(low, sight.min(0)), np.maximum(high, sight.max(0)))[1]
-        votes = vote(near.points, masked, pose, settings.min_votes)
-        print(f"{votes.object.sum()} of {len(scene)} scene points by the votes of the masks", flush=True)
-        marks, other, notes = np.concatenate([near.points[votes.object], votes.own]), votes.other, masked.notes
+        voted, other = vote(near.points, masked, pose, settings.min_votes)
+        print(f"{voted.sum()} of {len(scene)} scene points by the votes of the masks", flush=True)
+        marks, notes = np.concatenate([near.points[voted], own]), masked.notes
     cut = crop_cloud(near, marks, UP, settings, other)
     points, clicked = _checked(scene, inputs, settings, cut)
     by = f"marked by {by} through the alignment from shared features"

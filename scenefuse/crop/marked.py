@@ -13,7 +13,7 @@ from scenefuse.cloud.cloud_file import MIN_STRAY_TIMES, NEIGHBOURS
 from scenefuse.cloud.clouds import Cloud, occupied_voxels, spacing, within
 from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
-from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3
+from scenefuse.core.transforms import FIXING_POINTS, UP, Array, Sim3
 from scenefuse.crop.crop_cloud import (
     LINK_FRACTION,
     MIN_PART_SHARE,
@@ -214,7 +214,7 @@ def _off_box(box: Array, pixels: Array, depth: Array, view: View) -> NDArray[np.
     return (depth <= 0) | (pixels < low).any(1) | (pixels > high).any(1)
 
 
-def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, other: NDArray[np.bool_]) -> Crop:
+def crop_grown(scene: Cloud, inside: Array, settings: CropSettings, other: NDArray[np.bool_]) -> Crop:
     """`crop_cloud` around clicks on one side of an object, grown along what they lie on, to its other sides (C5).
 
     Each round takes the points of the last crop as its marks, until one adds no more surface than a part that would be
@@ -222,13 +222,12 @@ def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, o
     connected with something much larger, the box around the clicks remains, and a note says so.
 
     Args:
-        scene: the dense cloud.
+        scene: the dense cloud, z up.
         inside: (F, 3) clicks on the object.
-        up: (3,) against gravity.
         settings: of the crop.
         other: (N,) points of the scene that are something else.
     """
-    first = cut = crop_cloud(scene, inside, up, settings, other)
+    first = cut = crop_cloud(scene, inside, UP, settings, other)
     extent = float(np.linalg.norm(np.ptp(inside, axis=0)))
     while True:
         own = without_strays(scene.points[cut.keep], STRAY_SHARE / 2)  # in each round again
@@ -237,7 +236,7 @@ def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, o
         if np.linalg.norm(np.ptp(own, axis=0)) > MAX_GROWTH * extent:
             break
         marks = np.concatenate([inside, own])
-        grown = crop_cloud(scene, marks, up, settings, other)
+        grown = crop_cloud(scene, marks, UP, settings, other)
         before, after = (occupied_voxels(scene.points[one.keep], LINK_FRACTION * extent) for one in (cut, grown))
         if after <= (1 + MIN_PART_SHARE) * before:
             return grown
@@ -247,21 +246,6 @@ def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, o
         " was cut out; click on the object's ends, and outside, on what it touches"
     )
     return replace(first, notes=[note, *first.notes])
-
-
-@dataclass(frozen=True)
-class Votes:
-    """Votes of an object's masks on points of the scene.
-
-    Attributes:
-        object: (N,) bool, True for points of the object.
-        other: (N,) bool, True for points of something else; points that too few photos show are neither.
-        own: (K, 3) SfM points of the object's photos on the object, in the scene frame.
-    """
-
-    object: NDArray[np.bool_]
-    other: NDArray[np.bool_]
-    own: Array
 
 
 @dataclass(frozen=True)
@@ -286,8 +270,11 @@ class Masked:
         return np.concatenate([own, np.clip(eyes, own.min(0) - far, own.max(0) + far)])
 
 
-def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: float) -> Votes:
-    """Project every point of a scene into an object's masks.
+def vote(
+    points: Array, masked: Masked, scene_from_object: Sim3, min_share: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Project every point of a scene into an object's masks: (N,) which are the object's, and which something else's;
+    points that too few photos show are neither.
 
     A photo votes on a point that falls into its frame and that no nearer scene point hides; three votes make a
     decision. A point is the object's when at least `min_share` of them have it inside their mask, enough photos have it
@@ -309,7 +296,7 @@ def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: floa
     rows = np.flatnonzero(is_object)
     reach = MAX_BEYOND_POINTS * float(np.linalg.norm(np.ptp(own, axis=0)))
     is_object[rows] = within(in_object[rows], own, reach)
-    return Votes(is_object, decided & (inside < 0.5 * shown), scene_from_object.apply(own))
+    return is_object, decided & (inside < 0.5 * shown)
 
 
 def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:

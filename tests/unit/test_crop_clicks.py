@@ -166,7 +166,7 @@ def test_from_a_dense_roof_the_crop_grows_down_walls_of_few_points():
     roof = np.c_[rng.uniform([-3, -2], [3, 2], (2400, 2)), np.full(2400, 3.0)]
     points = np.concatenate([walls[walls[:, 2] < 2.99], roof, rng.uniform([-9, -9, 0], [9, 9, 0.02], (32400, 3))])
     corners = np.array([(-2, -1.5, 3), (2, -1.5, 3), (2, 1.5, 3), (-2, 1.5, 3)])
-    cut = crop_grown(Cloud(points), corners, np.array([0, 0, 1.0]), CropSettings(), np.zeros(len(points), bool))
+    cut = crop_grown(Cloud(points), corners, CropSettings(), np.zeros(len(points), bool))
     assert cut.keep[points[:, 2] > 0.3].mean() > 0.98 and cut.keep[points[:, 2] < 0.02].mean() < 0.01
 
 

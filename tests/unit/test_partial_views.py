@@ -115,11 +115,11 @@ def test_points_of_a_scene_that_few_photos_frame_are_the_objects(name):
     boxes, photos = CAPTURES[name][0], CAPTURES[name][1]()
     own = surface(boxes, 300)
     # What one side hides from another is left to the photos: here the points that most of them show.
-    votes = vote(own, Masked(photos, own), Sim3.identity(), 0.8)
+    voted, _ = vote(own, Masked(photos, own), Sim3.identity(), 0.8)
     front = own[:, 1] < 0.1 if name == "facade" else np.abs(own[:, :2]).max(1) > 0.19
-    assert votes.object[front].mean() > 0.7
+    assert voted[front].mean() > 0.7
     lower = front & (own[:, 2] < 0.6 * own[:, 2].max())
-    assert votes.object[lower].mean() > 0.7
+    assert voted[lower].mean() > 0.7
 
 
 def test_one_mask_that_lacks_the_head_takes_it_from_no_object():
