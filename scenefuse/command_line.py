@@ -10,6 +10,7 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
+from scenefuse.core.stage import StageError, run
 from scenefuse.core.version import VERSION
 
 ALL = "pip install 'scenefuse[all]'"
@@ -42,7 +43,6 @@ def main() -> None:
 
 def _register() -> None:
     """register one cloud with another, and fuse both"""
-    from scenefuse.core.stage import run
     from scenefuse.two_clouds.register import register
 
     run(register)
@@ -50,7 +50,6 @@ def _register() -> None:
 
 def _nerf() -> None:
     """train a NeRF on posed photos"""
-    from scenefuse.core.stage import run
     from scenefuse.nerf.train_nerf import train_nerf
 
     run(train_nerf)
@@ -58,7 +57,6 @@ def _nerf() -> None:
 
 def _pick() -> None:
     """open a page to click what an object is in its photos"""
-    from scenefuse.core.stage import run
     from scenefuse.pick.pick import pick
 
     _need_project("--configfile", "-h", "--help")
@@ -69,7 +67,6 @@ def _pick() -> None:
 
 def _init() -> None:
     """make a folder for a project of your own"""
-    from scenefuse.core.stage import run
     from scenefuse.new_project import init
 
     run(init)
@@ -135,7 +132,6 @@ def _run() -> None:
     All options are Snakemake's: python -m snakemake --help
     """
     from scenefuse.complete import snakemake_command
-    from scenefuse.core.stage import StageError
 
     if find_spec("snakemake") is None:
         raise ModuleNotFoundError(name="snakemake")
@@ -157,7 +153,6 @@ def _run() -> None:
 def _complete() -> None:
     """complete objects in a scene: photos in, the completed cloud and a report out"""
     from scenefuse.complete import complete
-    from scenefuse.core.stage import run
 
     if find_spec("snakemake") is None:
         raise ModuleNotFoundError(name="snakemake")

@@ -15,6 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -188,8 +189,6 @@ class _Nodes:
     """
 
     def __init__(self, file: BinaryIO, header: Any, low: Steps, bits: int) -> None:
-        import lazrs
-
         self.file, self.header, self.half = file, header, 2.0 ** (bits - 1) * header.scales[0]
         self.middle = (low + 2.0 ** (bits - 1)) * header.scales + header.offsets
         columns = header.point_format
@@ -201,8 +200,6 @@ class _Nodes:
 
     def add(self, key: Key, records: Records) -> None:
         """Write a node, if it has points."""
-        import lazrs
-
         if not len(records):
             return
         stream = io.BytesIO()
@@ -216,8 +213,6 @@ class _Nodes:
 
     def finish(self) -> None:
         """Write what lies behind the nodes, and the header once more."""
-        import lazrs
-
         place, table = self.file.tell(), io.BytesIO()
         lazrs.write_chunk_table(table, [(count, size) for _, _, size, count in self.chunks], self.laszip)
         self.file.write(table.getvalue())

@@ -4,7 +4,6 @@ Photos have measured both sides by now (`measure`), and the object has settled (
 through goes; where both sides measured a place, one stays.
 """
 
-from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -51,22 +50,9 @@ BETTER_FACTOR = 1.5
 DENSER_FACTOR = 2.0
 
 
-@dataclass(frozen=True)
-class Compared:
-    """What becomes of the points of both sides.
-
-    Attributes:
-        added: (N,) of the object's points that come into the scene.
-        contradicted: (N,) of the object's points that are not measured and have texture, those that photos see through.
-        reason: (M,) uint8 of the scene's points: Reason.KEPT, or why it is taken away.
-    """
-
-    added: Mask
-    contradicted: Mask
-    reason: NDArray[np.uint8]
-
-
-def compare(obj: Measured, scene: Measured, disputed: Mask, views: list[View], share: float = 1.0) -> Compared:
+def compare(
+    obj: Measured, scene: Measured, disputed: Mask, views: list[View], share: float = 1.0
+) -> tuple[Mask, Mask, NDArray[np.uint8]]:
     """Decide which points of both sides stay.
 
     Measured points count as real surface, which hides what is behind it. A measured point of the scene is removed only
@@ -78,6 +64,10 @@ def compare(obj: Measured, scene: Measured, disputed: Mask, views: list[View], s
         disputed: (M,) of these, points that the object's photos dispute; see `measure_again`.
         views: the photos of both sides.
         share: of the scene's points there that are given.
+
+    Returns:
+        (N,) of the object's points, those that come into the scene, and those that are not measured and have texture,
+        and that photos see through; (M,) of the scene's points, Reason.KEPT, or why each is taken away.
     """
     diagonal = obj.cloud.diagonal
     surface = obj.cloud[obj.surface]
@@ -106,7 +96,7 @@ def compare(obj: Measured, scene: Measured, disputed: Mask, views: list[View], s
     stays = concatenate([obj.cloud[added], scene.cloud[reason == Reason.KEPT]])
     reach = SAME_PLACE_SPACINGS * spacing(scene.cloud.points)
     reason[removed[_alone(scene.cloud.points[removed], stays, reach)]] = Reason.KEPT
-    return Compared(added, contradicted, reason)
+    return added, contradicted, reason
 
 
 def better_measured(obj: Measured, scene: Measured, diagonal: float, share: float) -> tuple[Mask, Mask]:

@@ -200,11 +200,10 @@ def check(
 
     theirs, disputed = measure_again(theirs, obj_photos, diagonal)
     views = obj_photos.views + scene_photos.views
-    decided = compare(mine, theirs, disputed, views, len(chosen) / max(len(scene), 1))
-    added, reason = decided.added, decided.reason
-    plain = plain_points(mine, decided.contradicted)
+    added, contradicted, reason = compare(mine, theirs, disputed, views, len(chosen) / max(len(scene), 1))
+    plain = plain_points(mine, contradicted)
     if unconfirmed != "none":
-        wanted = plain if unconfirmed == "plain" else ~mine.surface & ~decided.contradicted
+        wanted = plain if unconfirmed == "plain" else ~mine.surface & ~contradicted
         added = added | gaps(mine.cloud, wanted, added, theirs.cloud[reason == Reason.KEPT])
     known = with_evidence(theirs, Evidence.STEREO_ONLY)
     if len(chosen) < len(scene):
@@ -218,7 +217,7 @@ def check(
     of_pose = 0.0 if on_world is None else deviations_of_pose(mine.cloud, on_world, obj.points.mean(0))
     own = with_evidence(mine, Evidence.NERF_ONLY, of_pose)
     own.fields["evidence"][plain] = Evidence.PLAIN
-    return Checked(settled, moved, own, added, decided.contradicted, known, reason, notes)
+    return Checked(settled, moved, own, added, contradicted, known, reason, notes)
 
 
 def _is_enough(photos: Photos) -> bool:

@@ -2,7 +2,7 @@
 upright."""
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from scenefuse.cloud.crs import check_in_area, grid_name, projected_crs
 from scenefuse.cloud.import_cloud import near_origin
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, value, write_json
 from scenefuse.core.transforms import FIXING_POINTS, Array, Sim3, box_corners, fit_sim3
-from scenefuse.georef.control import CHECK, Control, read_control_points
+from scenefuse.georef.control import CHECK, Control, SurveyedPoint, read_control_points
 from scenefuse.georef.on_cloud import lay_on_cloud
 from scenefuse.georef.placement import (
     PHOTOS_OF_ONE_ERROR,
@@ -30,7 +30,6 @@ from scenefuse.georef.placement import (
     upright,
 )
 from scenefuse.georef.residuals import Georeference, georeference_report, residuals_of, write_residuals
-from scenefuse.marks.clicks import Click
 from scenefuse.marks.triangulation import read_lengths
 from scenefuse.photos.cameras.given import Place, read_place
 from scenefuse.photos.geodesy import MAX_GPS_OFF_M, LocalFrame, local_frame
@@ -235,27 +234,24 @@ def adjust_georeferenced(model: pycolmap.Reconstruction, found: Georeference, fr
         return {}
     chosen = placement.inliers if len(placement.inliers) else np.zeros(len(gps.names), dtype=bool)
     places = frame.apply(gps.positions[chosen]) - placement.gps_shift
-    photos = SurveyedPhotos([n for n, c in zip(gps.names, chosen) if c], places, gps.sd_m[chosen])
+    photos = list(zip([n for n, c in zip(gps.names, chosen) if c], places, gps.sd_m[chosen]))
     used = [s for s, u in zip(found.located, placement.used) if u]
-    if not (used or photos.names):
+    if not (used or photos):
         return {}
-    points = SurveyedPoints(
-        frame.apply(np.array([s.point.position for s in used]).reshape(-1, 3)),
-        np.array([s.point.sd_m for s in used]).reshape(-1, 2),
-        placement.local_from_model.apply(np.array([s.x_in_model for s in used]).reshape(-1, 3)),
-        [s.point.clicks for s in used],
-    )
+    there = frame.apply(np.array([s.point.position for s in used]).reshape(-1, 3))
+    seen = placement.local_from_model.apply(np.array([s.x_in_model for s in used]).reshape(-1, 3))
+    points = list(zip([s.point for s in used], there, seen))
     before_px = model.compute_mean_reprojection_error()
     adjust_to_survey(model, freedom, photos, points)
     drop_outliers(model)
     after_px = model.compute_mean_reprojection_error()
     print(
-        f"adjusted to {len(used)} control points and {len(photos.names)} positions: reprojection error"
+        f"adjusted to {len(used)} control points and {len(photos)} positions: reprojection error"
         f" {before_px:.3f} px before, {after_px:.3f} px after",
         flush=True,
     )
     return {
-        "adjusted_to_positions": quantity(len(photos.names), "1"),
+        "adjusted_to_positions": quantity(len(photos), "1"),
         "mean_reprojection_error_px": quantity(after_px, "px"),
     }
 
@@ -277,43 +273,11 @@ def camera_poses(model: pycolmap.Reconstruction) -> tuple[list[str], Array, Arra
     return [image.name for image in images], matrices[:, :, :3], matrices[:, :, 3]
 
 
-@dataclass(frozen=True)
-class SurveyedPhotos:
-    """N photos whose positions are known.
-
-    Attributes:
-        names: of the photos, all registered.
-        x_in_local: (N, 3) metres; NaN where a height is unknown.
-        sd_m: (N, 2) standard deviations, horizontal (of each axis) and vertical.
-    """
-
-    names: list[str]
-    x_in_local: Array
-    sd_m: Array
-
-
-@dataclass(frozen=True)
-class SurveyedPoints:
-    """P points whose coordinates are known.
-
-    Attributes:
-        x_in_local: (P, 3) metres; NaN where a height is unknown.
-        sd_m: (P, 2) standard deviations, horizontal (of each axis) and vertical.
-        start: (P, 3) where the model's photos see them.
-        clicks: P lists of clicks, in pixels of the model's photos.
-    """
-
-    x_in_local: Array
-    sd_m: Array
-    start: Array
-    clicks: list[list[Click]]
-
-
 def adjust_to_survey(
     model: pycolmap.Reconstruction,
     freedom: Freedom,
-    photos: SurveyedPhotos,
-    points: SurveyedPoints,
+    photos: list[tuple[str, Array, Array]],
+    points: list[tuple[SurveyedPoint, Array, Array]],
 ) -> None:
     """Adjust a model that lies in the local frame (metres) in place, by reprojection errors and by what was surveyed.
 
@@ -326,14 +290,16 @@ def adjust_to_survey(
     Args:
         model: registered photos and points, georeferenced.
         freedom: what of the cameras may change.
-        photos, points: what was surveyed; either may be empty, not both.
+        photos: names, positions (3,) and their standard deviations (2,), horizontal (of each axis) and vertical.
+        points: surveyed points, their coordinates (3,), and where (3,) the model's photos see them. Unknown heights are
+            NaN; either list may be empty, not both.
     """
     held = copy.deepcopy(model)
     config = pycolmap.BundleAdjustmentConfig()
     for image in held.reg_image_ids():
         config.add_image(image)
-    still = [camera for k in range(len(points.clicks)) for camera in _add_point(held, points, k)]
-    priors = [_position_prior(held, photos, row) for row in range(len(photos.names))]
+    still = [camera for point in points for camera in _add_point(held, *point)]
+    priors = [_position_prior(held, *photo) for photo in photos]
     still += _held(held, len(priors) - len(still))
     for image in still:
         config.add_image(image)
@@ -360,23 +326,23 @@ def adjust_to_survey(
     model.update_point_3d_errors()
 
 
-def _add_point(model: pycolmap.Reconstruction, points: SurveyedPoints, row: int) -> list[int]:
+def _add_point(model: pycolmap.Reconstruction, point: SurveyedPoint, place: Array, start: Array) -> list[int]:
     """Add a surveyed point with its clicks; ids of the cameras that measure its coordinates."""
-    place, (horizontal, vertical) = points.x_in_local[row], CAMERA_DISTANCE_M / points.sd_m[row]
+    horizontal, vertical = CAMERA_DISTANCE_M / np.array(point.sd_m)
     track = pycolmap.Track()
     by_name = {model.images[i].name: i for i in model.reg_image_ids()}
-    for click in points.clicks[row]:
+    for click in point.clicks:
         observed = model.images[by_name[click.photo]].points2D
         observed.append(pycolmap.Point2D(click.pixel))
         track.add_element(by_name[click.photo], len(observed) - 1)
-    known = np.where(np.isfinite(place), place, points.start[row])
+    known = np.where(np.isfinite(place), place, start)
     still = [_add_camera(model, DOWN, known, (horizontal, horizontal))]
     if np.isfinite(place[2]):
         # Its focal length counts the horizontal coordinate for nothing.
         still.append(_add_camera(model, NORTH, known, (1e-9, vertical)))
     for image in still:
         track.add_element(image, 0)
-    model.add_point3D(points.start[row], track)
+    model.add_point3D(start, track)
     return still
 
 
@@ -409,9 +375,8 @@ def _held(model: pycolmap.Reconstruction, count: int) -> list[int]:
     return [_add_camera(model, DOWN, corners[k % 8] * (1 + k // 8), (1.0, 1.0)) for k in range(max(8, count))]
 
 
-def _position_prior(model: pycolmap.Reconstruction, photos: SurveyedPhotos, row: int) -> pycolmap.PosePrior:
-    image = model.find_image_with_name(photos.names[row])
-    place, (horizontal, vertical) = photos.x_in_local[row], photos.sd_m[row]
+def _position_prior(model: pycolmap.Reconstruction, name: str, place: Array, sd_m: Array) -> pycolmap.PosePrior:
+    image, (horizontal, vertical) = model.find_image_with_name(name), sd_m
     known = np.where(np.isfinite(place), place, image.projection_center())
     up = vertical if np.isfinite(place[2]) else CAMERA_DISTANCE_M
     return _prior(image, known, np.array([horizontal, horizontal, up]))

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import open3d as o3d
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import quantity, write_json
@@ -124,8 +125,6 @@ def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:
     Args:
         problem: the clouds, and the scale at which the object is taken: the centre of the range.
     """
-    import open3d as o3d
-
     voxel = VOXEL_FRACTION * problem.scene.diagonal
     scaled = Sim3(problem.scales.centre, np.eye(3), np.zeros(3))
     source, source_features = _features(scaled.apply(problem.object.points), voxel)
@@ -146,8 +145,6 @@ def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:
 
 def _ransac(clouds: tuple[Any, Any], features: tuple[Any, Any], distance: float, seed: int) -> Any:
     """Open3D's RANSAC over mutual matches of two clouds by their features, seeded and on one thread."""
-    import open3d as o3d
-
     registration = o3d.pipelines.registration
     checks = [
         registration.CorrespondenceCheckerBasedOnEdgeLength(EDGE_LENGTH),
@@ -169,8 +166,6 @@ def _ransac(clouds: tuple[Any, Any], features: tuple[Any, Any], distance: float,
 
 def _features(points: Array, voxel: float) -> tuple[Any, Any]:
     """(N, 3) points thinned to one per voxel, with normals, as an Open3D cloud; and their FPFH features."""
-    import open3d as o3d
-
     pcd = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(voxel)
     pcd.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(NORMAL_RADIUS * voxel, NORMAL_NEIGHBOURS))
     search = o3d.geometry.KDTreeSearchParamHybrid(FEATURE_RADIUS * voxel, FEATURE_NEIGHBOURS)
@@ -179,8 +174,6 @@ def _features(points: Array, voxel: float) -> tuple[Any, Any]:
 
 def paper_fine(cloud: Cloud, scene: Cloud, start: Sim3) -> Sim3:
     """Point-to-point ICP, scale held, within 0.4 voxel, at most 35 iterations, both clouds at half a voxel."""
-    import open3d as o3d
-
     registration = o3d.pipelines.registration
     voxel = VOXEL_FRACTION * scene.diagonal
     pcd = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (start.apply(cloud.points), scene.points)]

@@ -4,30 +4,12 @@ Open3D misreads positions that are binary doubles, without a word.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scenefuse.cloud.readers.columns import Columns, check_count, stored_rows
-
-
-@dataclass(frozen=True)
-class _Header:
-    """What a file says of its rows.
-
-    Attributes:
-        row: its fields by their names and types, each of one number or several.
-        count: of rows.
-        data: ascii, binary or binary_compressed.
-        begin: the byte where the rows begin.
-    """
-
-    row: np.dtype[Any]
-    count: int
-    data: str
-    begin: int
 
 
 def read_pcd(path: Path, at_once: int) -> Iterator[Columns]:
@@ -37,18 +19,20 @@ def read_pcd(path: Path, at_once: int) -> Iterator[Columns]:
         StageError: the file is cut short, or holds more points than its header counts.
         ValueError: it is no PCD, or damaged.
     """
-    header = _header(path)
-    if header.data == "binary_compressed":
-        parts = _compressed(path, header, at_once)
-    elif header.data in ("ascii", "binary"):
-        parts = stored_rows(path, header.begin, header.row, header.count, at_once, header.data == "ascii")
+    data, begin, row, count = _header(path)
+    if data == "binary_compressed":
+        parts = _compressed(path, begin, row, count, at_once)
+    elif data in ("ascii", "binary"):
+        parts = stored_rows(path, begin, row, count, at_once, data == "ascii")
     else:
-        raise ValueError(f"its DATA is '{header.data}'")
+        raise ValueError(f"its DATA is '{data}'")
     for fields in parts:
         yield {name: values for name, values in fields.items() if values.ndim == 1 and not name.startswith(" ")}
 
 
-def _header(path: Path) -> _Header:
+def _header(path: Path) -> tuple[str, int, np.dtype[Any], int]:
+    """How rows are stored (ascii, binary or binary_compressed), the byte where they begin, their fields by names and
+    types, each of one number or several, and how many they are."""
     words: dict[str, list[str]] = {}
     with open(path, "rb") as file:
         while "DATA" not in words:
@@ -71,24 +55,24 @@ def _header(path: Path) -> _Header:
     if data == "binary" and (there < count or not odd):
         check_count(path, count, there)
     row = np.dtype([(name, kind, (k,) if k != 1 else ()) for name, kind, k in zip(names, types, repeats)])
-    return _Header(row, count, data, begin)
+    return data, begin, row, count
 
 
-def _compressed(path: Path, header: _Header, at_once: int) -> Iterator[Columns]:
+def _compressed(path: Path, begin: int, row: np.dtype[Any], count: int, at_once: int) -> Iterator[Columns]:
     """The fields of compressed columns, one after the other."""
     with open(path, "rb") as file:
-        file.seek(header.begin)
+        file.seek(begin)
         packed, size = (int(number) for number in np.fromfile(file, "<u4", 2))
         content = file.read()[:packed]
     check_count(path, packed, len(content), "bytes")
     # A copy of 264 bytes takes three.
-    if size > 88 * packed or size != header.count * header.row.itemsize:
+    if size > 88 * packed or size != count * row.itemsize:
         raise ValueError("its compressed part is not as long as its header says")
     raw, fields, at = _lzf(content, size), Columns(), 0
-    for name in header.row.names or ():
-        fields[name] = np.ndarray(header.count, header.row[name], raw, at)
-        at += header.row[name].itemsize * header.count
-    for first in range(0, header.count, at_once):
+    for name in row.names or ():
+        fields[name] = np.ndarray(count, row[name], raw, at)
+        at += row[name].itemsize * count
+    for first in range(0, count, at_once):
         yield {name: values[first : first + at_once] for name, values in fields.items()}
 
 
