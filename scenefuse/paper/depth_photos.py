@@ -32,8 +32,7 @@ class DepthPhotos:
         sources: (V, S) indices of the photos each photo is compared with, best first, never held out.
         points: V float32 arrays (N, 3): column, row (pixels) and depth of the SfM points on the object.
         checks: as `points`: every tenth SfM point, never shown to the network, to measure with.
-        near: nearest depth the network can say, object units.
-        far: farthest.
+        near: nearest depth of the object, its units.
         diagonal: diagonal of the box around the object's SfM points, object units.
     """
 
@@ -46,7 +45,6 @@ class DepthPhotos:
     points: list[NDArray[np.float32]]
     checks: list[NDArray[np.float32]]
     near: float
-    far: float
     diagonal: float
 
     def source_from_target(self, target: Tensor, source: Tensor) -> Tensor:
@@ -73,7 +71,6 @@ def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhoto
         [pixels[ids % CHECK_EVERY != 0] for ids, pixels in pairs],
         [pixels[ids % CHECK_EVERY == 0] for ids, pixels in pairs],
         float(known.near.min()),
-        float(known.far.max()),
         float(np.linalg.norm(high - low)),
     )
 

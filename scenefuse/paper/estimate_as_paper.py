@@ -20,7 +20,7 @@ from scenefuse.nerf.rendered_maps import DepthPrior, read_stage_maps, write_prio
 from scenefuse.nerf.train_object_nerf import MIN_CONFIDENCE
 from scenefuse.paper import monocular
 from scenefuse.paper.depth_photos import DepthPhotos, align_maps, depth_photos, depths_at
-from scenefuse.paper.monocular import Content, MonocularSettings, Networks, Supervision
+from scenefuse.paper.monocular import Content, MonocularSettings, Networks
 from scenefuse.paper.network_training import Recipe, loss_quantities, optimise, predict, prepare_torch
 from scenefuse.photos.views import Views, load_views
 from scenefuse.photos.workspace import read_workspace, write_model
@@ -169,7 +169,7 @@ def estimate_as_paper(
     frames, networks = monocular.frames_of(views, device), monocular.new_monocular_networks(device)
     content = few_frames(int(frames.trained.sum()))
     stage = Stage(workspace, outputs, checkpoints, views, frames, pose_source, seed)
-    stage.run(networks, monocular.supervision_of(frames), settings.epochs, content)
+    stage.run(networks, settings.epochs, content)
 
 
 def few_frames(count: int) -> Content:
@@ -203,23 +203,25 @@ class Stage:
     pose_source: PoseSource
     seed: int
 
-    def run(self, networks: Networks, supervision: Supervision, epochs: int, content: Content) -> None:
-        """Train, and write depth maps, networks, poses and the report, with `content`."""
+    def run(
+        self, networks: Networks, epochs: int, content: Content, known: tuple[Tensor, Tensor] | None = None
+    ) -> None:
+        """Train, write depth maps, networks, poses and the report, with `content`; `known` as of `monocular_losses`."""
         start, recipe = time.monotonic(), Recipe(epochs)
         print(f"{len(self.views.names)} frames, {recipe.steps(self.frames)} steps", flush=True)
-        key = key_of("paper", recipe, self.seed, self.frames, supervision, networks.state())
+        key = key_of("paper", recipe, self.seed, self.frames, known, networks.state())
         checkpoint = self.checkpoints / key / "state.pt"
-        objective = monocular.monocular_losses(networks, self.frames, supervision, recipe)
+        objective = monocular.monocular_losses(networks, self.frames, recipe, known)
         losses = optimise(networks.parts(), self.frames, objective, recipe, checkpoint, self.seed)
-        raw = predict(networks.depth, self.frames, supervision.colors, supervision.first)
+        raw = predict(networks.depth, self.frames)
         placed = place(raw, networks, self.frames, self.views, self.pose_source)
-        depth, known = placed.depth * placed.measured.masks, self.views.object_from_cam
+        depth, poses = placed.depth * placed.measured.masks, self.views.object_from_cam
         maps = depth[:, 0].cpu().numpy()
         with atomic_directory(self.outputs.stage) as folder:
             write_prior(folder, self.views, DepthPrior(maps, (maps > 0).astype(np.float32)))
             monocular.save_networks(folder / "networks.pt", networks, maps.shape[2], placed.unit)
         write_posed(self.workspace, self.outputs.posed, self.views, placed.poses)
-        chain = chain_quantities(placed.chain, known, placed.poses, self.pose_source)
+        chain = chain_quantities(placed.chain, poses, placed.poses, self.pose_source)
         write_json(self.outputs.posed_json, chain)
         content |= {
             "steps": quantity(recipe.steps(self.frames), "1"),
@@ -227,7 +229,7 @@ class Stage:
             "unit": quantity(placed.unit, "object units per unit of the networks"),
             **monocular.map_quantities(depth, placed.measured),
             **loss_quantities(losses),
-            **monocular.pose_quantities(networks.pose, self.frames, in_unit(known, placed.unit)),
+            **monocular.pose_quantities(networks.pose, self.frames, in_unit(poses, placed.unit)),
             "seconds": quantity(round(time.monotonic() - start, 1), "s"),
         }
         write_json(self.outputs.report, content)
@@ -320,7 +322,7 @@ def refine_as_paper(
     print(f"accepted {blend.shares['accepted_share']:.0%} of the object's pixels", flush=True)
     content = {name: quantity(share, "1") for name, share in blend.shares.items()}
     stage = Stage(workspace, outputs, checkpoints, views, frames, pose_source, seed)
-    stage.run(networks, monocular.supervision_of(frames, blend.depth / unit, blend.weight), settings.epochs, content)
+    stage.run(networks, settings.epochs, content, (blend.depth / unit, blend.weight))
 
 
 def _depths(earlier: EarlierStages, views: Views, device: torch.device) -> tuple[Tensor, Tensor]:

@@ -21,10 +21,10 @@ from scenefuse.mvs.plane_sweep import MIN_TEXTURE
 from scenefuse.nerf.rendered_maps import MAP_AGREEMENT
 from scenefuse.paper.depth_photos import DepthPhotos, residual_at_checks
 from scenefuse.paper.monodepth import (
+    NEAR,
     DepthNetwork,
     convolutions,
     depth_from_disparity,
-    disparity_from_depth,
     inside,
     masked_mean,
     points_in_cam,
@@ -35,8 +35,6 @@ from scenefuse.paper.monodepth import (
 from scenefuse.paper.network_training import Objective, PhotoScale, Recipe, huber, reprojection_error
 from scenefuse.photos.views import Views
 
-# What the depth network can say: an object that fits into its photos, about 1 away, is neither nearer nor farther.
-NEAR = 0.5
 # Photos are compared at these fractions of their size one after the other, in equal parts of the training.
 SHRINKS = (4, 2, 1)
 Content = dict[str, Any]
@@ -132,17 +130,6 @@ def pose_quantities(network: PoseNetwork, photos: DepthPhotos, poses: Array) -> 
 
 
 @dataclass(frozen=True)
-class Supervision:
-    """What the networks are trained on, (V, 3, H, W) colours from -1 to 1 and (V, 1, H, W) first disparities; in stage
-    3 (V, 1, H, W) depths to learn and their weights, 0 where there is none."""
-
-    colors: Tensor
-    first: Tensor
-    target: Tensor | None = None
-    weight: Tensor | None = None
-
-
-@dataclass(frozen=True)
 class MonocularSettings:
     """How long the networks train, and on what."""
 
@@ -179,7 +166,6 @@ def frames_of(views: Views, device: torch.device) -> DepthPhotos:
         nothing,
         nothing,
         NEAR,
-        1 / NEAR,
         diagonal=1.0,
     )
     _check_motion(frames)
@@ -212,29 +198,25 @@ def _check_motion(frames: DepthPhotos) -> None:
 
 def new_monocular_networks(device: torch.device) -> Networks:
     """Untrained networks: depth from colours alone, motion in the networks' unit."""
-    return Networks(DepthNetwork(3).to(device), PoseNetwork().to(device))
+    return Networks(DepthNetwork().to(device), PoseNetwork().to(device))
 
 
-def supervision_of(frames: DepthPhotos, target: Tensor | None = None, weight: Tensor | None = None) -> Supervision:
-    """Colours, with a first depth of 1 everywhere; (V, 1, H, W) target depths and weights."""
-    one = disparity_from_depth(torch.ones_like(frames.masks), NEAR, 1 / NEAR)
-    return Supervision(frames.images * 2.0 - 1.0, one, target, weight)
-
-
-def monocular_losses(networks: Networks, frames: DepthPhotos, supervision: Supervision, recipe: Recipe) -> Objective:
+def monocular_losses(
+    networks: Networks, frames: DepthPhotos, recipe: Recipe, known: tuple[Tensor, Tensor] | None = None
+) -> Objective:
     """Monodepth2's loss of depth and motion together: minimum reprojection over the neighbours, auto-mask, smoothness.
 
     The auto-mask is that of full size, as there: on small photos of an object in their middle it leaves nothing at all.
-    With target depths (stage 3) the depth network is also held to these, and the pose network to what the frames look
-    like through them.
+    With known depths (V, 1, H, W) and their weights, 0 where there is none (stage 3), the depth network is also held to
+    these, and the pose network to what the frames look like through them.
     """
     scales, small = [PhotoScale(frames, shrink) for shrink in SHRINKS], small_photos(frames)
     steps = recipe.steps(frames)
 
     def losses(chosen: Tensor, step: int, generator: torch.Generator) -> dict[str, Tensor]:
         scale = scales[step * len(scales) // steps]
-        disparity = networks.depth(supervision.colors[chosen], supervision.first[chosen])
-        depth = depth_from_disparity(disparity, NEAR, 1 / NEAR)
+        disparity = networks.depth(frames.images[chosen])
+        depth = depth_from_disparity(disparity)
         sources = frames.sources[chosen]
         moves = torch.stack([networks.pose(small[chosen], small[of]) for of in sources.T], 1)
         unmoved = scale.unmoved[chosen] if scale is scales[-1] else None
@@ -243,8 +225,8 @@ def monocular_losses(networks: Networks, frames: DepthPhotos, supervision: Super
             "photometric": masked_mean(error, counts),
             "smoothness": smoothness(disparity, frames.images[chosen], frames.masks[chosen]),
         }
-        if supervision.target is not None and supervision.weight is not None:
-            target, weight = supervision.target[chosen], supervision.weight[chosen]
+        if known is not None:
+            target, weight = (maps[chosen] for maps in known)
             given = torch.where(weight > 0, target, depth.detach())
             error, seen = reprojection_error(scale, chosen, sources, given, moves, None)
             off = huber(depth / target.clamp_min(NEAR) - 1.0)

@@ -23,6 +23,8 @@ from torch.nn import functional
 
 # alpha of equation (2), as in Monodepth2.
 SSIM_WEIGHT = 0.85
+# What the depth network can say: an object that fits into its photos, about 1 away, is neither nearer nor farther.
+NEAR = 0.5
 
 
 def points_in_cam(depth: Tensor, intrinsics: Tensor) -> Tensor:
@@ -134,33 +136,27 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 
 class DepthNetwork(nn.Module):
-    """U-Net that predicts normalised disparity: sigmoid(logit(first) + correction).
+    """U-Net that predicts normalised disparity from colours: sigmoid(logit(first) + correction).
 
-    The last layer starts at zero, so that training starts from the first disparity.
-
-    Args:
-        channels: input channels beside the first disparity.
+    The first disparity is that of a depth of 1. The last layer starts at zero, so that training starts from it.
     """
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self) -> None:
         super().__init__()
         sizes = [16, 32, 48, 64]
-        self.encoder = nn.ModuleList(
-            convolutions(before, after, 2) for before, after in zip([channels + 1, *sizes[:-1]], sizes)
-        )
+        self.encoder = nn.ModuleList(convolutions(before, after, 2) for before, after in zip([4, *sizes[:-1]], sizes))
         self.decoder = nn.ModuleList(
             convolutions(deep + skip, skip, 1) for deep, skip in zip(sizes[:0:-1], sizes[-2::-1])
         )
-        self.head = nn.Conv2d(sizes[0] + channels + 1, 16, 3, padding=1, padding_mode="replicate")
+        self.head = nn.Conv2d(sizes[0] + 4, 16, 3, padding=1, padding_mode="replicate")
         self.last = nn.Conv2d(16, 1, 3, padding=1, padding_mode="replicate")
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
 
-    def forward(self, inputs: Tensor, first: Tensor) -> Tensor:
-        """(B, C, H, W) inputs and (B, 1, H, W) first disparity in 0..1 -> (B, 1, H, W) disparity in 0..1."""
-        first = first.clamp(0.002, 0.998)
-        logit = torch.logit(first)
-        stacked = torch.cat([inputs, first * 2 - 1], 1)
+    def forward(self, photos: Tensor) -> Tensor:
+        """(B, 3, H, W) photos in 0..1 -> (B, 1, H, W) disparity in 0..1."""
+        first = torch.full_like(photos[:, :1], (1 - NEAR) / (1 / NEAR - NEAR))
+        stacked = torch.cat([photos, first], 1) * 2 - 1
         levels = []
         x = stacked
         for block in self.encoder:
@@ -169,17 +165,12 @@ class DepthNetwork(nn.Module):
         for block, skip in zip(self.decoder, levels[-2::-1]):
             x = block(torch.cat([_resize_like(x, skip), skip], 1))
         x = functional.elu(self.head(torch.cat([_resize_like(x, stacked), stacked], 1)))
-        return torch.sigmoid(logit + self.last(x))
+        return torch.sigmoid(torch.logit(first) + self.last(x))
 
 
-def depth_from_disparity(disparity: Tensor, near: float, far: float) -> Tensor:
-    """Normalised disparity 0..1 -> depth: 0 is `far`, 1 is `near` (Monodepth2, section 3.1, in its depth range)."""
-    return 1.0 / (1.0 / far + (1.0 / near - 1.0 / far) * disparity)
-
-
-def disparity_from_depth(depth: Tensor, near: float, far: float) -> Tensor:
-    """Depth -> normalised disparity, clamped to 0..1."""
-    return ((1.0 / depth.clamp_min(1e-9) - 1.0 / far) / (1.0 / near - 1.0 / far)).clamp(0.0, 1.0)
+def depth_from_disparity(disparity: Tensor) -> Tensor:
+    """Normalised disparity 0..1 -> depth from 1 / NEAR to NEAR (Monodepth2, section 3.1, in this depth range)."""
+    return 1.0 / (NEAR + (1.0 / NEAR - NEAR) * disparity)
 
 
 def convolutions(before: int, after: int, stride: int) -> nn.Sequential:

@@ -119,10 +119,9 @@ def optimise(
 
 
 @torch.no_grad()
-def predict(network: DepthNetwork, photos: DepthPhotos, channels: Tensor, first: Tensor) -> Tensor:
-    """(V, 1, H, W) depth of all photos, held-out ones too, from input channels and first disparities."""
-    parts = zip(*(maps.split(8) for maps in (channels, first)))
-    return depth_from_disparity(torch.cat([network(x, d) for x, d in parts]), photos.near, photos.far)
+def predict(network: DepthNetwork, photos: DepthPhotos) -> Tensor:
+    """(V, 1, H, W) depth of all photos, held-out ones too."""
+    return depth_from_disparity(torch.cat([network(part) for part in photos.images.split(8)]))
 
 
 def loss_quantities(losses: list[dict[str, float]]) -> dict[str, Any]:

@@ -301,17 +301,17 @@ def photo_refinement() -> Row:
 
 def paper_networks() -> Row:
     """The paper's networks of stage 1 on a small video: the first loss; seconds of twenty steps."""
-    from scenefuse.paper.monocular import frames_of, monocular_losses, new_monocular_networks, supervision_of
+    from scenefuse.paper.monocular import frames_of, monocular_losses, new_monocular_networks
 
     def losses() -> tuple[float, float]:
         device, length = torch.device("cuda" if torch.cuda.is_available() else "cpu"), Recipe(20, 1)
         torch.manual_seed(0)
         frames = frames_of(sideways_video(6), device)
-        networks, supervision = new_monocular_networks(device), supervision_of(frames)
-        objective = monocular_losses(networks, frames, supervision, length)
+        networks = new_monocular_networks(device)
+        objective = monocular_losses(networks, frames, length)
         with tempfile.TemporaryDirectory() as name:
             told = optimise(networks.parts(), frames, objective, length, Path(name) / "state.pt", 0)
-        predict(networks.depth, frames, supervision.colors, supervision.first)
+        predict(networks.depth, frames)
         return told[0]["photometric"], told[-1]["photometric"]
 
     here, cpu, there, gpu_s = both(losses)

@@ -31,7 +31,6 @@ from scenefuse.paper.monocular import (
     monocular_losses,
     new_monocular_networks,
     pose_quantities,
-    supervision_of,
 )
 from scenefuse.paper.network_training import Recipe, optimise, predict, prepare_torch
 from scenefuse.photos.views import Views
@@ -94,14 +93,14 @@ def learned(views: Views, true: Array, diagonal: float, epochs: int, seed: int) 
     start = time.monotonic()
     device = prepare_torch(seed)
     frames, networks = frames_of(views, device), new_monocular_networks(device)
-    supervision, recipe = supervision_of(frames), Recipe(epochs)
-    objective = monocular_losses(networks, frames, supervision, recipe)
+    recipe = Recipe(epochs)
+    objective = monocular_losses(networks, frames, recipe)
     with tempfile.TemporaryDirectory() as folder:
         optimise(networks.parts(), frames, objective, recipe, Path(folder) / "state.pt", seed)
     own = chained(networks.pose, frames)
     motions = pose_quantities(networks.pose, frames, unit_of(own, views.object_from_cam))
     chain = trajectory_error("chain", own, views.object_from_cam)
-    raw = predict(networks.depth, frames, supervision.colors, supervision.first)
+    raw = predict(networks.depth, frames)
     depth = raw[:, 0].cpu().numpy().astype(np.float64)
     return {
         "steps": recipe.steps(frames),

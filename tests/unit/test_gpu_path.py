@@ -16,7 +16,7 @@ from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.rays import LossWeights
 from scenefuse.nerf.render import render_view
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
-from scenefuse.paper.monocular import frames_of, monocular_losses, new_monocular_networks, supervision_of
+from scenefuse.paper.monocular import frames_of, monocular_losses, new_monocular_networks
 from scenefuse.paper.network_training import Recipe, optimise, predict
 from scenefuse.paper.train_nerf_as_paper import NERF, OrderAndEdges
 
@@ -73,14 +73,14 @@ def test_the_papers_networks_train_on_a_gpu(gpu, tmp_path):
     frames, length = frames_of(sideways_video(6), cuda), Recipe(1, 1)
     target, weight = torch.full_like(frames.masks, 1.4), torch.ones_like(frames.masks)
     networks = new_monocular_networks(cuda)
-    for supervision in (supervision_of(frames), supervision_of(frames, target, weight)):
+    for known in (None, (target, weight)):
         losses = optimise(
             networks.parts(),
             frames,
-            monocular_losses(networks, frames, supervision, length),
+            monocular_losses(networks, frames, length, known),
             length,
             tmp_path / "state.pt",
             0,
         )
         assert np.isfinite(losses[-1]["photometric"])
-        assert bool((predict(networks.depth, frames, supervision.colors, supervision.first) > 0).all())
+        assert bool((predict(networks.depth, frames) > 0).all())

@@ -11,11 +11,11 @@ from support.sideways_video import sideways_video
 
 from scenefuse.core.stage import StageError
 from scenefuse.paper.depth_photos import align_to_points
-from scenefuse.paper.monocular import frames_of, monocular_losses, new_monocular_networks, rigid, supervision_of
+from scenefuse.paper.monocular import frames_of, monocular_losses, new_monocular_networks, rigid
 from scenefuse.paper.monodepth import (
+    NEAR,
     DepthNetwork,
     depth_from_disparity,
-    disparity_from_depth,
     minimum_reprojection,
     photometric_error,
     smoothness,
@@ -91,18 +91,16 @@ def test_smoothness_by_hand():
     assert smoothness(disparity, image, one_column).item() == 0.0
 
 
-def test_disparity_and_depth_are_inverse_and_span_the_range():
-    ends = depth_from_disparity(torch.tensor([0.0, 1.0]), 2.0, 5.0)
-    assert torch.allclose(ends, torch.tensor([5.0, 2.0]))
-    depth = torch.tensor([2.0, 3.3, 5.0])
-    assert torch.allclose(depth_from_disparity(disparity_from_depth(depth, 2.0, 5.0), 2.0, 5.0), depth, atol=1e-5)
+def test_disparity_spans_the_range_of_depths():
+    ends = depth_from_disparity(torch.tensor([0.0, 1.0]))
+    assert torch.allclose(ends, torch.tensor([1 / NEAR, NEAR]))
 
 
-def test_the_network_is_small_and_starts_from_the_first_disparity():
-    network = DepthNetwork(3)
+def test_the_network_is_small_and_starts_from_a_depth_of_one():
+    network = DepthNetwork()
     assert sum(weights.numel() for weights in network.parameters()) < 1_000_000
-    first = torch.rand(2, 1, 33, 50) * 0.8 + 0.1
-    assert torch.allclose(network(torch.randn(2, 3, 33, 50), first), first, atol=1e-5)
+    depth = depth_from_disparity(network(torch.rand(2, 3, 33, 50)))
+    assert torch.allclose(depth, torch.ones(2, 1, 33, 50), atol=1e-5)
 
 
 def test_alignment_finds_a_planted_scale_and_shift_among_outliers():
@@ -128,7 +126,7 @@ def _train(checkpoint, frames, stop_at=None):
     """Trained networks and their losses; a SIGTERM comes in step `stop_at`."""
     torch.manual_seed(0)
     networks = new_monocular_networks(torch.device("cpu"))
-    objective = monocular_losses(networks, frames, supervision_of(frames), RECIPE)
+    objective = monocular_losses(networks, frames, RECIPE)
     calls, original = iter(range(1000)), torch.optim.Adam.step
 
     def step(self, *args):
@@ -176,7 +174,7 @@ def test_a_truncated_checkpoint_starts_the_training_afresh_and_says_so(tmp_path,
 
 
 def test_a_diverged_training_is_one_sentence_and_saves_nothing(tmp_path):
-    network, checkpoint = DepthNetwork(3), tmp_path / "state.pt"
+    network, checkpoint = DepthNetwork(), tmp_path / "state.pt"
 
     def losses(chosen, step, generator):
         loss = network.last.bias.sum()

@@ -39,7 +39,6 @@ from scenefuse.paper.monocular import (
     neighbours,
     new_monocular_networks,
     small_photos,
-    supervision_of,
 )
 from scenefuse.paper.network_training import Recipe, optimise, predict
 from scenefuse.paper.train_nerf_as_paper import RANK_WEIGHT, as_paper, train_nerf_as_paper
@@ -111,31 +110,30 @@ def test_where_nothing_moves_with_the_camera_nothing_is_learned():
     stuck[:, :, :32] = stuck[0, :, :32]  # as a sticker on the lens
     frames = frames_of(replace(video, images=stuck), CPU)
     networks, length = new_monocular_networks(CPU), Recipe(3, 1)
-    objective, chosen = monocular_losses(networks, frames, supervision_of(frames), length), torch.arange(3)
+    objective, chosen = monocular_losses(networks, frames, length), torch.arange(3)
     last = length.steps(frames) - 1  # the full size
     masked = objective(chosen, last, torch.Generator())["photometric"]
     beside = replace(frames, masks=frames.masks.clone())
     beside.masks[..., :32] = 0
-    alone = monocular_losses(networks, beside, supervision_of(beside), length)(chosen, last, torch.Generator())
+    alone = monocular_losses(networks, beside, length)(chosen, last, torch.Generator())
     assert float(masked) == pytest.approx(float(alone["photometric"]), rel=0.15)
 
 
-def _trained(frames, path, epochs=30, **target):
+def _trained(frames, path, epochs=30, known=None):
     """Networks trained on frames, and their losses."""
     torch.manual_seed(0)
     networks, length = new_monocular_networks(CPU), Recipe(epochs, 2)
-    supervision = supervision_of(frames, **target)
-    objective = monocular_losses(networks, frames, supervision, length)
+    objective = monocular_losses(networks, frames, length, known)
     losses = optimise(networks.parts(), frames, objective, length, path, 0)
-    return networks, supervision, losses
+    return networks, losses
 
 
 @torch.no_grad()
-def _shifts_px(networks, frames, supervision):
+def _shifts_px(networks, frames):
     """Columns by which depth and motion together move the middle of each frame into the next."""
     small = small_photos(frames)
     motion = networks.pose(small[:-1], small[1:])
-    depth = predict(networks.depth, frames, supervision.colors, supervision.first)
+    depth = predict(networks.depth, frames)
     middle = torch.zeros(len(small) - 1, 3)
     middle[:, 2] = depth[:-1, 0, depth.shape[2] // 2, depth.shape[3] // 2]
     moved = (motion[:, :3, :3] @ middle[:, :, None])[..., 0] + motion[:, :3, 3]
@@ -145,9 +143,9 @@ def _shifts_px(networks, frames, supervision):
 @pytest.mark.slow
 def test_depth_and_motion_are_learned_from_a_video_alone(tmp_path):
     frames = frames_of(sideways_video(), CPU)
-    networks, supervision, losses = _trained(frames, tmp_path / "state.pt")
+    networks, losses = _trained(frames, tmp_path / "state.pt")
     assert losses[-1]["photometric"] < 0.2 * losses[0]["photometric"]
-    assert float(_shifts_px(networks, frames, supervision).median()) == pytest.approx(-SHIFT_PX, abs=0.5)
+    assert float(_shifts_px(networks, frames).median()) == pytest.approx(-SHIFT_PX, abs=0.5)
 
 
 @pytest.mark.slow
@@ -155,17 +153,17 @@ def test_fused_depth_refines_the_depth_network_however_far_off_it_is(tmp_path, w
     """The video alone leaves it at 1.35, where depth and motion fit each other at any scale."""
     frames = frames_of(sideways_video(), CPU)
     target, weight = torch.full_like(frames.masks, wanted), torch.ones_like(frames.masks)
-    networks, supervision, losses = _trained(frames, tmp_path / "state.pt", target=target, weight=weight)
-    depth = predict(networks.depth, frames, supervision.colors, supervision.first)
+    networks, losses = _trained(frames, tmp_path / "state.pt", known=(target, weight))
+    depth = predict(networks.depth, frames)
     assert torch.median((depth - wanted).abs()) < 0.05 and losses[-1]["target"] < 0.05 * losses[0]["target"]
-    assert float(_shifts_px(networks, frames, supervision).median()) == pytest.approx(-SHIFT_PX, abs=0.5)
+    assert float(_shifts_px(networks, frames).median()) == pytest.approx(-SHIFT_PX, abs=0.5)
 
 
 def test_fused_depth_teaches_the_pose_network_what_the_frames_look_like_through_it():
     frames = frames_of(sideways_video(), CPU)
     target, weight = torch.full_like(frames.masks, 1.4), torch.ones_like(frames.masks)
     networks, length = new_monocular_networks(CPU), Recipe(1, 1)
-    objective = monocular_losses(networks, frames, supervision_of(frames, target, weight), length)
+    objective = monocular_losses(networks, frames, length, (target, weight))
     objective(torch.arange(3), 0, torch.Generator())["pose"].backward()
     slope = {
         name: sum(float(p.grad.abs().sum()) for p in getattr(networks, name).parameters() if p.grad is not None)
@@ -176,10 +174,10 @@ def test_fused_depth_teaches_the_pose_network_what_the_frames_look_like_through_
 
 def test_every_step_moves_both_networks(tmp_path):
     frames = frames_of(sideways_video(), CPU)
-    supervision = supervision_of(frames, torch.full_like(frames.masks, 1.4), torch.ones_like(frames.masks))
+    known = torch.full_like(frames.masks, 1.4), torch.ones_like(frames.masks)
     networks, length = new_monocular_networks(CPU), Recipe(2, 1)
     before = {name: [part.clone() for part in network.parameters()] for name, network in networks.parts().items()}
-    objective = monocular_losses(networks, frames, supervision, length)
+    objective = monocular_losses(networks, frames, length, known)
     optimise(networks.parts(), frames, objective, length, tmp_path / "state.pt", 0)
     for name, network in networks.parts().items():
         assert any(not torch.equal(a, b) for a, b in zip(before[name], network.parameters()))
