@@ -2,7 +2,6 @@
 cloud; triples of matches."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,13 +95,13 @@ def refine_planes(
         rows = _rows(obj, scene, pose, tau, color_weight)
         if rows is None:
             return pose
-        system, right = rows.system.copy(), rows.right
+        system, right, centre, reach = rows
         if scales.width == 0:
             system[6], system[:, 6], right[6], system[6, 6] = 0, 0, 0, 1
         step = np.asarray(-np.linalg.solve(system * (1 + 1e-9 * np.eye(7)), right), np.float64)
-        pose = moved_about(pose, step, rows.centre, scales)
+        pose = moved_about(pose, step, centre, scales)
         # How far the step moves the paired points.
-        if np.linalg.norm(step[3:6]) + rows.reach * (np.linalg.norm(step[:3]) + abs(step[6])) < 0.005 * tau:
+        if np.linalg.norm(step[3:6]) + reach * (np.linalg.norm(step[:3]) + abs(step[6])) < 0.005 * tau:
             break
     return pose
 
@@ -171,26 +170,17 @@ def change_between(pose: Sim3, other: Sim3, at: Array) -> Array:
     return np.array([*turn, *(other.apply(at) - pose.apply(at)), np.log(other.scale / pose.scale)])
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """The linearised fit at one pose, over rotation, translation and log scale: `system` step + `right` = 0.
-
-    Attributes:
-        system: (7, 7) of the normal equations.
-        right: (7,).
-        centre: (3,) that the step turns and grows about.
-        reach: RMS distance of the paired points from it.
-    """
-
-    system: Array
-    right: Array
-    centre: Array
-    reach: float
-
-
-def _rows(obj: Surface, scene: Surface, pose: Sim3, tau: float, color_weight: float) -> _Rows | None:
+def _rows(
+    obj: Surface, scene: Surface, pose: Sim3, tau: float, color_weight: float
+) -> tuple[Array, Array, Array, float] | None:
     """Rows of the pairs both ways, None with too few: point-to-plane, a little point-to-point against the sliding that
-    planes leave free, and colours where both sides have them."""
+    planes leave free, and colours where both sides have them.
+
+    Returns:
+        The fit at the pose, linear in rotation, translation and log scale: normal equations (7, 7) and (7,), of which
+        the first times the step, plus the second, is 0; the centre (3,) that the step turns and grows about; the RMS
+        distance of the paired points from it.
+    """
     pairs = _without_overhang(obj, scene, pose, tau, pair(obj, scene, pose, tau))
     if min(pairs.forward, len(pairs.distance) - pairs.forward) < 7:
         return None
@@ -214,7 +204,7 @@ def _rows(obj: Surface, scene: Surface, pose: Sim3, tau: float, color_weight: fl
             change = (theirs - mine)[:, channel]
             parts.append(_weighted(lever[ahead], slopes[:, channel], change, color_weight / 3 * weights[ahead]))
     systems, rights = zip(*parts)
-    return _Rows(sum(systems), sum(rights), centre, float(np.sqrt((lever**2).sum(1).mean())))
+    return sum(systems), sum(rights), centre, float(np.sqrt((lever**2).sum(1).mean()))
 
 
 def _without_overhang(obj: Surface, scene: Surface, pose: Sim3, tau: float, pairs: Pairs) -> Pairs:
@@ -253,21 +243,9 @@ def _weighted(lever: Array, direction: Array, residual: Array, weight: Array) ->
     return weighted.T @ jacobian, weighted.T @ residual
 
 
-class Triples(NamedTuple):
-    """Triples of matches.
-
-    Attributes:
-        rows: (N, 3) of the matches.
-        edges: lengths (N, 3) of their edges on either side.
-        scale: (N,) geometric mean of the three edges' ratios.
-    """
-
-    rows: NDArray[np.int64]
-    edges: tuple[Array, Array]
-    scale: Array
-
-
-def triples_of_one_scale(x: Array, y: Array, count: int, rng: np.random.Generator) -> Triples:
+def triples_of_one_scale(
+    x: Array, y: Array, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], tuple[Array, Array], Array]:
     """Random triples of matches whose three edges are longer on one side by nearly the same factor (Fischler 1981).
 
     Args:
@@ -275,10 +253,14 @@ def triples_of_one_scale(x: Array, y: Array, count: int, rng: np.random.Generato
         y: (M, 3) their partners.
         count: triples drawn.
         rng: draws them.
+
+    Returns:
+        (N, 3) rows of the matches, lengths (N, 3) of their edges on either side, and (N,) geometric means of the ratios
+        of these.
     """
     rows = rng.integers(0, len(x), (count, 3))
     a, b = (np.linalg.norm(side[rows] - side[np.roll(rows, 1, axis=1)], axis=2) for side in (x, y))
     ratio = b / np.maximum(a, 1e-12)
     good = ratio.min(1) > MIN_EDGE_RATIO * ratio.max(1)
     scale = np.exp(np.log(np.maximum(ratio[good], 1e-12)).mean(1))
-    return Triples(rows[good], (a[good], b[good]), scale)
+    return rows[good], (a[good], b[good]), scale

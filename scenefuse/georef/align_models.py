@@ -211,10 +211,10 @@ def _most_supported(seen: Observations, seed: int) -> Sim3 | None:
     if len(seen.x) < 4:
         return None
     rng = np.random.default_rng(seed)
-    found = triples_of_one_scale(seen.x, seen.y, RANSAC_SAMPLES, rng)
-    wide = found.edges[0].min(1) > 0.1 * found.edges[0].max(1)
+    triples, (edges, _), _ = triples_of_one_scale(seen.x, seen.y, RANSAC_SAMPLES, rng)
+    wide = edges.min(1) > 0.1 * edges.max(1)
     proposed = []
-    for triple in found.rows[wide][:MAX_TRIPLES]:
+    for triple in triples[wide][:MAX_TRIPLES]:
         with contextlib.suppress(ValueError):
             proposed.append(fit_sim3(seen.x[triple], seen.y[triple]))
     if not proposed:

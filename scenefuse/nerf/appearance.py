@@ -54,16 +54,6 @@ class Appearance:
         return torch.exp(self.log_gain[view] + (self.falloff * radius2)[:, None])
 
 
-@dataclass(frozen=True)
-class SharedColors:
-    """Places that two photos show: views a and b (N,), squared radii (N, 2), log colour in a less that in b (N, 3)."""
-
-    a: Tensor
-    b: Tensor
-    radius2: Tensor
-    difference: Tensor
-
-
 def find_appearance(field: Field, occupancy: Occupancy, photos: PhotoTensors, samples: int) -> Appearance:
     """Gains and vignetting from the places that several photos show, as the field's depths have them.
 
@@ -94,11 +84,12 @@ def shrunk(photos: PhotoTensors) -> PhotoTensors:
     return PhotoTensors(images, masks, mattes, intrinsics, photos.rotation, photos.center, nothing, nothing)
 
 
-def shared_colors(photos: PhotoTensors, depths: Tensor) -> SharedColors:
-    """Pairs of pixels (V, h, w) that show one place, from depths (V, h, w) along z, 0 for none."""
+def shared_colors(photos: PhotoTensors, depths: Tensor) -> tuple[Tensor, ...]:
+    """Places that two photos show, from depths (V, h, w) along z, 0 for none: views a and b (N,), squared radii (N, 2),
+    log colour in a less that in b (N, 3)."""
     near = nearest(photos.center, COMPARED_PHOTOS)
     parts = [_shared(photos, depths, view, int(other)) for view in range(len(photos)) for other in near[view]]
-    return SharedColors(*(torch.cat(column) for column in zip(*parts)))
+    return tuple(torch.cat(column) for column in zip(*parts))
 
 
 def _shared(photos: PhotoTensors, depths: Tensor, a: int, b: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -120,15 +111,14 @@ def _shared(photos: PhotoTensors, depths: Tensor, a: int, b: int) -> tuple[Tenso
     return index * a, index * b, torch.stack(radius2, 1)[kept], (ours[kept] / theirs[kept]).log()
 
 
-def solved(shared: SharedColors, photos: int) -> Appearance:
+def solved(shared: tuple[Tensor, ...], photos: int) -> Appearance:
     """Gains and vignetting that shared colours agree under: least squares of log colours, with Huber's weights.
 
     A weak pull, a share of the pairs, holds gains at 1 and the vignetting at none where the pairs leave them open. A
     photo that shares no colours gets a gain of 1.
     """
-    a, b, count = shared.a, shared.b, max(len(shared.a), 1)
-    radial = (shared.radius2[:, 0] - shared.radius2[:, 1]).double()
-    difference = shared.difference.double()
+    a, b, radius2, difference = shared
+    radial, difference, count = (radius2[:, 0] - radius2[:, 1]).double(), difference.double(), max(len(a), 1)
     pairs = torch.bincount(a, minlength=photos) + torch.bincount(b, minlength=photos)
     log_gain, falloff = torch.zeros(photos, 3, dtype=torch.float64), torch.zeros((), dtype=torch.float64)
     for _ in range(10):

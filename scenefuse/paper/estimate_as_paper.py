@@ -318,11 +318,12 @@ def refine_as_paper(
     networks, width_px, unit = monocular.load_networks(earlier.previous / "networks.pt", device)
     views, used = (load_views(folder, masks, width_px, hold_out_every) for folder in (workspace, poses))
     frames = monocular.frames_of(views, device)
-    blend = monocular.blend_depths(*_depths(earlier, views, device), photos_at(used.object_from_cam, views, frames))
-    print(f"accepted {blend.shares['accepted_share']:.0%} of the object's pixels", flush=True)
-    content = {name: quantity(share, "1") for name, share in blend.shares.items()}
+    measured = photos_at(used.object_from_cam, views, frames)
+    depth, weight, shares = monocular.blend_depths(*_depths(earlier, views, device), measured)
+    print(f"accepted {shares['accepted_share']:.0%} of the object's pixels", flush=True)
+    content = {name: quantity(share, "1") for name, share in shares.items()}
     stage = Stage(workspace, outputs, checkpoints, views, frames, pose_source, seed)
-    stage.run(networks, settings.epochs, content, (blend.depth / unit, blend.weight))
+    stage.run(networks, settings.epochs, content, (depth / unit, weight))
 
 
 def _depths(earlier: EarlierStages, views: Views, device: torch.device) -> tuple[Tensor, Tensor]:

@@ -260,30 +260,17 @@ def variance_between_views(depth: Tensor, photos: DepthPhotos) -> Tensor:
     return variance
 
 
-@dataclass(frozen=True)
-class Blend:
-    """Stage 1's and rendered depth blended.
-
-    Attributes:
-        depth: (V, 1, H, W), 0 where neither was accepted.
-        weight: (V, 1, H, W) weight of each pixel as a target, 0..1.
-        shares: of the object's pixels that were rendered, accepted, blended.
+def blend_depths(predicted: Tensor, rendered: Tensor, photos: DepthPhotos) -> tuple[Tensor, Tensor, dict[str, float]]:
+    """Blend two sets of (V, 1, H, W) depth maps, each weighted by its agreement between views: depths, 0 where neither
+    was accepted; their weights as targets, 0..1; shares of the object's pixels that were rendered, accepted, blended.
     """
-
-    depth: Tensor
-    weight: Tensor
-    shares: dict[str, float]
-
-
-def blend_depths(predicted: Tensor, rendered: Tensor, photos: DepthPhotos) -> Blend:
-    """Blend two sets of (V, 1, H, W) depth maps, each weighted by its agreement between views."""
     variances = [variance_between_views(depth, photos) for depth in (predicted, rendered)]
     depth, variance = fuse_by_inverse_variance(predicted, rendered, *variances)
     weight = ((MAP_AGREEMENT * photos.diagonal) ** 2 / variance).clamp(0.0, 1.0)
     both = (depth > 0) & torch.isfinite(variances[0]) & torch.isfinite(variances[1])
     counted = {"accepted_share": depth > 0, "blended_share": both, "rendered_share": rendered > 0}
     area = photos.masks.sum().clamp_min(1)
-    return Blend(depth, weight, {name: float(where.sum() / area) for name, where in counted.items()})
+    return depth, weight, {name: float(where.sum() / area) for name, where in counted.items()}
 
 
 def fuse_by_inverse_variance(first: Tensor, second: Tensor, *variances: Tensor) -> tuple[Tensor, Tensor]:
