@@ -66,6 +66,12 @@ class Cloud:
         normals = None if self.normals is None else b_from_a.rotate(self.normals).astype(np.float32)
         return replace(self, points=b_from_a.apply(self.points), normals=normals)
 
+    @property
+    def known_normals(self) -> NDArray[np.float32]:
+        """(N, 3) the normals of a cloud that was given some."""
+        assert self.normals is not None
+        return self.normals
+
     @cached_property
     def diagonal(self) -> float:
         """Length of the axis-aligned bounding box's diagonal."""

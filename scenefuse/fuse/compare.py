@@ -178,9 +178,8 @@ def _times_as_many(points: Array, others: Array, reach: float) -> float:
 
 def _beside(points: Array, partners: Cloud) -> Array:
     """How far (N,) points lie beside their partners, along the surface of these."""
-    assert partners.normals is not None
     away = points - partners.points
-    along = (away * partners.normals).sum(1)
+    along = (away * partners.known_normals).sum(1)
     return np.asarray(np.sqrt(np.maximum((away**2).sum(1) - along**2, 0)))
 
 
@@ -202,9 +201,8 @@ def _rougher(one: Cloud, two: Cloud, side: float) -> tuple[Array, Array]:
 
 def _cells_by_side(cloud: Cloud, low: Array, side: float) -> NDArray[np.int64]:
     """(N, 4) cell of each point, and which of six ways it faces."""
-    assert cloud.normals is not None
-    axis = np.abs(cloud.normals).argmax(1)
-    backwards = cloud.normals[np.arange(len(cloud)), axis] < 0
+    axis = np.abs(cloud.known_normals).argmax(1)
+    backwards = cloud.known_normals[np.arange(len(cloud)), axis] < 0
     cells = np.floor((cloud.points - low) / side).astype(np.int64)
     return np.column_stack([cells, axis + 3 * backwards])
 
@@ -233,12 +231,11 @@ def gaps(obj: Cloud, wanted: Mask, added: Mask, scene: Cloud) -> Mask:
     there, rows = concatenate([obj[added], scene]), np.flatnonzero(wanted)
     if len(there) == 0 or not len(rows):
         return wanted
-    assert obj.normals is not None and there.normals is not None
     tree, reach = cKDTree(there.points), RESOLUTION * obj.diagonal
     distance, near = tree.query(obj.points[rows], NEIGHBOURS, distance_upper_bound=reach, workers=threads())
     near = np.minimum(near, len(there) - 1).ravel()
     own = np.repeat(rows, NEIGHBOURS)
-    alike = (obj.normals[own] * there.normals[near]).sum(1) > 0
+    alike = (obj.known_normals[own] * there.known_normals[near]).sum(1) > 0
     beside = _beside(obj.points[own], there[near]) <= SAME_PLACE_SPACINGS * spacing(obj.points)
     same = (np.isfinite(distance.ravel()) & alike & beside).reshape(-1, NEIGHBOURS).any(1)
     found = wanted.copy()

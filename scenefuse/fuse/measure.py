@@ -126,10 +126,9 @@ def plain_points(obj: Measured, contradicted: NDArray[np.bool_]) -> NDArray[np.b
     side = RESOLUTION * obj.cloud.diagonal
     cells, known = voxel_average(obj.cloud[chosen], side), voxel_average(obj.cloud[obj.surface], side)
     lists = cKDTree(known.points).query_ball_point(cells.points, 2 * NEAR * obj.cloud.diagonal, workers=threads())
-    assert cells.normals is not None and known.normals is not None
     found = [
-        _continued(known.points[near] - point, known.normals[near], normal, side)
-        for point, normal, near in zip(cells.points, cells.normals.astype(np.float64), lists)
+        _continued(known.points[near] - point, known.known_normals[near], normal, side)
+        for point, normal, near in zip(cells.points, cells.known_normals.astype(np.float64), lists)
     ]
     taken = np.zeros(len(obj.cloud), dtype=bool)
     taken[chosen] = np.array(found)[voxels(obj.cloud.points[chosen], side)[0]] > SECTORS / 2
@@ -217,6 +216,5 @@ def deviations_of_pose(cloud: Cloud, covariance: Array, centre: Array) -> Array:
         covariance: (7, 7) of the pose about `centre`: rotation vector (radians), shift, log scale.
         centre: (3,) in the scene.
     """
-    assert cloud.normals is not None
-    along = similarity_rows(cloud.points - centre, cloud.normals.astype(np.float64))
+    along = similarity_rows(cloud.points - centre, cloud.known_normals.astype(np.float64))
     return np.asarray(np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", along, covariance, along), 0)))

@@ -123,8 +123,7 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     centres, normals = grid.middle(found), towards[found]
     own = supposed[found]
     if own.any():
-        assert loose.normals is not None
-        normals[own] = loose.normals[cKDTree(loose.points).query(centres[own], workers=threads())[1]]
+        normals[own] = loose.known_normals[cKDTree(loose.points).query(centres[own], workers=threads())[1]]
     cells = Cloud(centres, normals)
     cells.fields["missing"] = _classes(cells, surface, photos, step, margin)
     few = f"{len(masks)} masks: what they do not frame is unknown, only points of the object's own cloud are looked at"
@@ -222,13 +221,12 @@ def _classes(
     cells: Cloud, surface: Cloud, photos: tuple[Photos, Photos], step: float, margin: float
 ) -> NDArray[np.uint8]:
     """Why each cell is missing, (K,): too few photos of either side see it, it has no texture, or they do not agree."""
-    assert cells.normals is not None
     seen, textured = np.zeros(len(cells), dtype=np.int64), np.zeros(len(cells), dtype=bool)
     for side in photos:
         shown = np.zeros(len(cells), dtype=np.int64)
         for view in side.views:
-            shown += shown_in(cells.points, cells.normals, surface, view, step, margin)
-        matches = match_in(cells.points, cells.normals, side)
+            shown += shown_in(cells.points, cells.known_normals, surface, view, step, margin)
+        matches = match_in(cells.points, cells.known_normals, side)
         # Photos from nearly the same place say nothing of a point's place: they are not tested.
         seen = np.maximum(seen, np.minimum(shown, matches.tested + 1))
         textured |= matches.textured
@@ -289,8 +287,7 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
     beside = apart < reach
     if not beside.any():
         return Plan([], 0.0)
-    assert around.normals is not None
-    obstacles = voxel_downsample(Cloud(around.points[beside], around.normals[beside]), missing.side)
+    obstacles = voxel_downsample(Cloud(around.points[beside], around.known_normals[beside]), missing.side)
     others = voxel_downsample(
         Cloud(around.points[apart < max(reach, reach_of_stations(obj, close_ups))]), clearance / 2
     )
@@ -398,10 +395,9 @@ def _tried(
     if len(rows) == 0:
         return tried
     part = cells[rows]
-    assert part.normals is not None
     toward = np.array([_directions(part.points, three[1].centre) for three in photos]).reshape(-1, len(rows), 3)
     for view in close_ups:
-        known = shown_in(part.points, part.normals, obstacles, view, step, margin)
+        known = shown_in(part.points, part.known_normals, obstacles, view, step, margin)
         beside = (toward * _directions(part.points, view.centre)).sum(2) > np.cos(GOOD_ANGLE)
         tried[:, rows] |= beside & known
     return tried
@@ -415,6 +411,5 @@ def _directions(points: Array, eye: Array) -> Array:
 
 def _shown_in_all(photos: list[View], cells: Cloud, obstacles: Cloud, step: float, margin: float) -> NDArray[np.bool_]:
     """(K,) cells that all the photos show."""
-    assert cells.normals is not None
-    shown = [shown_in(cells.points, cells.normals, obstacles, photo, step, margin) for photo in photos]
+    shown = [shown_in(cells.points, cells.known_normals, obstacles, photo, step, margin) for photo in photos]
     return np.asarray(np.logical_and.reduce(shown))

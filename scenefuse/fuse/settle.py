@@ -67,8 +67,7 @@ def _surface(cloud: Cloud) -> Surface:
     """A cloud made ready for refinement: drawn evenly, since averages would round corners off; a quarter queries."""
     thin = cloud[np.sort(np.random.default_rng(0).permutation(len(cloud))[:SAMPLED_POINTS])]
     colors = None if thin.colors is None else thin.colors / 255.0
-    assert thin.normals is not None
-    normals = thin.normals.astype(np.float64)
+    normals = thin.known_normals.astype(np.float64)
     surface = Surface(thin.points, normals, colors, cKDTree(thin.points), np.arange(len(thin)))
     return with_queries(surface, SAMPLED_POINTS // 4)
 

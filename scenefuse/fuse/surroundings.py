@@ -43,12 +43,11 @@ def places_on_ground(obj: Cloud, scene: Cloud, step: float, gap: float = 0.0) ->
     """
     low, high, reach = obj.points.min(0), obj.points.max(0), reach_of(obj)
     ground = fit_ground(scene.points, low, high, reach, RESOLUTION * obj.diagonal)
-    assert scene.normals is not None
-    known = np.abs(scene.normals).argmax(1) == 2
+    known = np.abs(scene.known_normals).argmax(1) == 2
     known &= False if ground is None else ground.height_of(scene.points) <= ground.tolerance
     if known.sum() < NEIGHBOURS:
         return Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
-    points, normals = scene.points[known], scene.normals[known] * np.sign(scene.normals[known, 2:])
+    points, normals = scene.points[known], scene.known_normals[known] * np.sign(scene.known_normals[known, 2:])
     sides = (np.arange(a - reach, b + reach, step) for a, b in zip(low[:2], high[:2]))
     xy = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     tree = cKDTree(points[:, :2])
@@ -110,10 +109,9 @@ def missing_ground(obj: Cloud, completed: Cloud, photos: tuple[Photos, Photos]) 
 
 def _shown_in_each(places: Cloud, surface: Cloud, views: list[View], side: float) -> NDArray[np.bool_]:
     """(V, N) whether each photo shows each place, past a surface with normals, to the side of a cell."""
-    assert places.normals is not None
     cells = voxel_downsample(Cloud(surface.points, surface.normals), side / 2)
     step = spacing(cells.points, quantile=SPARSEST)
-    shown = [shown_in(places.points, places.normals, cells, view, step, side) for view in views]
+    shown = [shown_in(places.points, places.known_normals, cells, view, step, side) for view in views]
     return np.array(shown, dtype=bool).reshape(len(views), len(places))
 
 

@@ -156,8 +156,7 @@ def _facing(points: Array, normals: NDArray[np.float32], view: View) -> NDArray[
 def _surface_in(surface: Cloud, view: View, spacing: float, both_sides: bool = False) -> tuple[View, Array]:
     """The photo in cells: the least depth of the surface in the 3 x 3 cells around each, and the largest (H, W), where
     most of them hold some; 0 elsewhere."""
-    assert surface.normals is not None
-    shown = surface.points if both_sides else surface.points[_facing(surface.points, surface.normals, view)]
+    shown = surface.points if both_sides else surface.points[_facing(surface.points, surface.known_normals, view)]
     buffer = depth_buffer(shown, view, CELL_SPACINGS * spacing)
     hit, around = buffer.pixels > 0, np.ones((3, 3))
     known = cv2.boxFilter(hit.astype(np.float64), -1, around.shape, borderType=cv2.BORDER_CONSTANT) > 0.5

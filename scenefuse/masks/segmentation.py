@@ -142,7 +142,6 @@ def segment_again(
 def _at_full_size(view: View, mask: Mask) -> Mask:
     """A mask (H, W) at its photo's resolution. Small parts of it stay: they were asked for, by a click or by points of
     other photos; small parts that the edges leave do not."""
-    assert view.pixels is not None
     edges = along_edges(view.pixels, mask, 4 * max(view.width, view.height) / SIDE_PX, SIDE_PX)
     asked = mask & ~cleaned(mask)
     return np.asarray(cleaned(edges, view.pixels) | (edges & asked))
