@@ -371,7 +371,8 @@ def whole_object(folder: Path) -> Row:
         def nerf(k: int, previous: Path | None) -> None:
             train_object_nerf(
                 inputs=NerfInputs(**photos, prior=out / f"stage{k - 1}", previous=previous),
-                **places[k],
+                stage=places[k]["stage"],
+                report=places[k]["report"],
                 checkpoints=out / "checkpoints",
                 settings=build(NerfSettings, settings["nerf"] | settings[f"stage{k}"]),
                 hold_out_every=held,
