@@ -40,7 +40,7 @@ from scenefuse.cloud.readers.las import ENDINGS, LAS_DIMENSIONS, NOISE, WITHHELD
 from scenefuse.cloud.readers.text import text_notes
 from scenefuse.cloud.tiled_cloud import Rows
 from scenefuse.core.stage import StageError, threads
-from scenefuse.core.transforms import Array
+from scenefuse.core.transforms import Array, inside_box
 
 # Points of a file, at most twice as many, that say where it lies.
 SAMPLE = AT_ONCE
@@ -229,7 +229,7 @@ class CloudFile:
 
         def look(columns: Columns, surface: Columns) -> None:
             nonlocal last
-            part.add(chosen_rows(surface, _inside(positions(surface), box))[0])
+            part.add(chosen_rows(surface, inside_box(positions(surface), *box))[0])
             last = max(last, int(np.nan_to_num(columns["source"]).max(initial=0)) if "source" in columns else 0)
 
         whole = summarise(path, look)
@@ -266,13 +266,9 @@ class CloudFile:
         """All points of a surface in the box from `low` (3,) to `high` (3,), and their rows (N,)."""
         found = [(np.zeros(0, np.int64), self.like)]
         for rows, cloud in self.parts():
-            inside = _inside(cloud.points, (low, high))
+            inside = inside_box(cloud.points, low, high)
             found.append((rows[inside], cloud[inside]))
         return np.concatenate([rows for rows, _ in found]), concatenate([cloud for _, cloud in found])
-
-
-def _inside(points: Array, box: Box) -> NDArray[np.bool_]:
-    return np.asarray(((points >= box[0]) & (points <= box[1])).all(1))
 
 
 def is_nothing_at_zero(others: NDArray[np.float64], zeros: int) -> bool:
@@ -325,7 +321,7 @@ def _box_of_most(
     low, high = np.percentile(points, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
     while True:
         size = float((high - low).max())
-        near = np.flatnonzero(((points >= low - size) & (points <= high + size)).all(1))
+        near = np.flatnonzero(inside_box(points, low, high, size))
         group, counts = voxels(points[near], COARSE_CUBE * size or 1.0)
         together = counts[group] > NEIGHBOURS
         part = points[near[together]]

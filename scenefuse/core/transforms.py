@@ -93,6 +93,11 @@ def box_corners(low: Array, high: Array) -> Array:
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
 
+def inside_box(points: Array, low: Array, high: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+    """(N,) which of the points (N, D) lie in the box from `low` (D,) to `high` (D,), its sides moved by `margin`."""
+    return np.asarray(((points >= low - margin) & (points <= high + margin)).all(1))
+
+
 def box_around(low: Array, high: Array, b_from_a: Sim3) -> tuple[Array, Array]:
     """Corners (3,) of the axis-aligned box in frame b around a box of frame a from `low` (3,) to `high` (3,)."""
     moved = b_from_a.apply(box_corners(low, high))

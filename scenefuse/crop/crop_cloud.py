@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, parts, spacing, voxels, within
 from scenefuse.core.stage import setting
-from scenefuse.core.transforms import UP, Array, rotation_between
+from scenefuse.core.transforms import UP, Array, inside_box, rotation_between
 from scenefuse.geometry.ground import Ground, fit_ground
 from scenefuse.geometry.surface import SCORE_FRACTION
 
@@ -95,7 +95,7 @@ def crop_cloud(
     extent = np.ptp(marks, axis=0)
     if settings.minimal:
         low, high = marks.min(0), marks.max(0)
-        inside = ((points >= low) & (points <= high)).all(1)
+        inside = inside_box(points, low, high)
         return Crop(inside, np.zeros_like(inside), level, low, high, None, [])
     diagonal = float(np.linalg.norm(extent))
     margin = settings.margin * extent + 2 * SCORE_FRACTION * diagonal
@@ -105,7 +105,7 @@ def crop_cloud(
         # Fiducials are clicked where the scene shows the object; what it stands on bounds it below.
         corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
         low[2] = min(low[2], ground.height(corners).min() - GROUND_FRACTION * diagonal)
-    in_box = ((points >= low) & (points <= high)).all(1)
+    in_box = inside_box(points, low, high)
     away = np.zeros(len(points), dtype=bool)
     if ground is not None and in_box.any():
         away = on_ground(points, marks, ground, in_box)
@@ -226,7 +226,7 @@ def without_strays(points: Array, share: float = STRAY_SHARE) -> Array:
     if not len(points):
         return points
     low, high = np.percentile(points, [100 * share, 100 * (1 - share)], axis=0)
-    return points[((points >= low) & (points <= high)).all(1)]
+    return points[inside_box(points, low, high)]
 
 
 def _foot(marks: Array) -> tuple[Array, float]:

@@ -10,7 +10,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.cloud.tiled_cloud import Rows, open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, read_json, threads, value, write_json
-from scenefuse.core.transforms import Array, Sim3, Uncertainty, box_around
+from scenefuse.core.transforms import Array, Sim3, Uncertainty, box_around, inside_box
 from scenefuse.fuse.compare import REASONS
 from scenefuse.fuse.measure import Evidence, deviations_of_pose, unchecked
 from scenefuse.fuse.modes import (
@@ -244,6 +244,5 @@ def evidence_report(fused: Fused, checked: Checked | None) -> dict[str, Any]:
 
 def _in_box(cloud: Cloud, crop_json: dict[str, Any]) -> Cloud:
     """The points in the box of a crop stage."""
-    low, high = np.array(value(crop_json, "box_low")), np.array(value(crop_json, "box_high"))
-    levelled = cloud.points @ np.array(value(crop_json, "level_from_scene")).T
-    return cloud[((levelled >= low) & (levelled <= high)).all(1)]
+    level, low, high = (np.array(value(crop_json, name)) for name in ("level_from_scene", "box_low", "box_high"))
+    return cloud[inside_box(cloud.points @ level.T, low, high)]

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, sampled_rows, spacing, within
 from scenefuse.cloud.tiled_cloud import Rows
 from scenefuse.core.stage import setting, threads
-from scenefuse.core.transforms import Array, Sim3, Uncertainty
+from scenefuse.core.transforms import Array, Sim3, Uncertainty, inside_box
 from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, Reason, compare, gaps
 from scenefuse.fuse.measure import (
     FIELDS,
@@ -153,8 +153,7 @@ def fuse_by_evidence(
 
 def around(scene: Cloud, obj: Cloud) -> NDArray[np.bool_]:
     """(N,) points of the scene that are checked: in the object's box, widened by NEAR."""
-    low, high, margin = obj.points.min(0), obj.points.max(0), NEAR * obj.diagonal
-    return ((scene.points >= low - margin) & (scene.points <= high + margin)).all(1)
+    return inside_box(scene.points, obj.points.min(0), obj.points.max(0), NEAR * obj.diagonal)
 
 
 def check(

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.cloud_file import NEIGHBOURS
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, within
 from scenefuse.core.stage import threads
-from scenefuse.core.transforms import Array
+from scenefuse.core.transforms import Array, inside_box
 from scenefuse.fuse.compare import SAME_PLACE_SPACINGS
 from scenefuse.fuse.measure import NEAR, RESOLUTION, Evidence, measure, unchecked, with_evidence, with_normals
 from scenefuse.fuse.missing import SPARSEST
@@ -71,8 +71,7 @@ def ground_to_add(obj: Cloud, scene: Cloud, added: Cloud, photos: Photos, pictur
         photos: the object's, in the scene's frame.
         picture: a view of these with its colours as pixels.
     """
-    low, high, reach = obj.points.min(0), obj.points.max(0), reach_of(obj)
-    around = scene[((scene.points >= low - reach) & (scene.points <= high + reach)).all(1)]
+    around = scene[inside_box(scene.points, obj.points.min(0), obj.points.max(0), reach_of(obj))]
     if min(len(around), len(added)) <= NEIGHBOURS:
         return unchecked(added[np.zeros(0, np.int64)])
     around, apart = with_normals(around), SAME_PLACE_SPACINGS * spacing(around.points)

@@ -22,7 +22,7 @@ from scenefuse.cloud.readers.las import LAS_DIMENSIONS
 from scenefuse.cloud.tiled_cloud import BOX, ROW_OF_TILE, Rows, TiledCloud, open_cloud, reserved
 from scenefuse.core.job_records import JobRecords, why_unfinished
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import Array, Sim3, inside_box
 from scenefuse.core.version import VERSION
 from scenefuse.fuse.compare import Reason
 from scenefuse.fuse.measure import FIELDS, Evidence, unchecked
@@ -378,8 +378,8 @@ def _apart(cloud: Cloud, before: list[Cloud]) -> Cloud:
     if not before or len(cloud) < 2:
         return cloud
     step = spacing(cloud.points)
-    low, high = cloud.points.min(0) - step, cloud.points.max(0) + step
-    there = np.concatenate([one.points[((one.points >= low) & (one.points <= high)).all(1)] for one in before])
+    low, high = cloud.points.min(0), cloud.points.max(0)
+    there = np.concatenate([one.points[inside_box(one.points, low, high, step)] for one in before])
     if not len(there):
         return cloud
     return cloud[~within(cloud.points, there, step)]

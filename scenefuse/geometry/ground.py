@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenefuse.core.transforms import SD_OVER_MEDIAN, Array
+from scenefuse.core.transforms import SD_OVER_MEDIAN, Array, inside_box
 from scenefuse.geometry.icp import MAX_TRIPLES
 
 # Cells along each side of the square around the ring; one low point stands for each, and half as many fix the ground.
@@ -62,10 +62,8 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
         The ground, or None when the ring is empty, no plane below 45 degrees fits at least 30 % of it, or what it fits
         is a narrow strip.
     """
-    xy = points[:, :2]
-    near = ((xy >= low[:2] - ring) & (xy <= high[:2] + ring)).all(1)
-    inside = ((xy >= low[:2]) & (xy <= high[:2])).all(1)
-    around = points[near & ~inside]
+    near = inside_box(points[:, :2], low[:2], high[:2], ring)
+    around = points[near & ~inside_box(points[:, :2], low[:2], high[:2])]
     if not len(around):
         return None
     lowest = _lowest(around, low[:2] - ring, float((high[:2] - low[:2] + 2 * ring).max()) / CELLS)

@@ -18,7 +18,7 @@ from scenefuse.cloud.formats import readable
 from scenefuse.cloud.import_cloud import crs_of
 from scenefuse.cloud.readers.las import check_projected
 from scenefuse.core.stage import StageError, quantity, threads, value
-from scenefuse.core.transforms import Array, Sim3, box_corners, rotation_angle_deg
+from scenefuse.core.transforms import Array, Sim3, box_corners, inside_box, rotation_angle_deg
 from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.icp import refine_on_cloud
 from scenefuse.geometry.surface import SAMPLED_POINTS, ends_of
@@ -76,7 +76,7 @@ def fit_to_cameras(points: Array, model: pycolmap.Reconstruction) -> dict[str, A
     own = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
     seen, centres = _seen(points[:: max(1, len(points) // SAMPLED_POINTS)], views), np.array([v.centre for v in views])
     points = points[:: max(1, len(points) // MAX_COMPARED)]
-    own = _in_box_of(points, own)
+    own = own[inside_box(own, *ends_of(points))]
     met = _met(points, own, centres)
     content = {"seen_share": quantity(seen, "1"), "met_share": quantity(met, "1")}
     if seen < MIN_SEEN or len(own) < MIN_OVER or met > USUAL_MET:
@@ -239,8 +239,7 @@ def _onto(cloud: Array, own: Array, name: str) -> Sim3:
 
 def _over(cloud: Array, own: Array) -> NDArray[np.bool_]:
     """(M,) which points of a model lie over a cloud (N, 3)."""
-    low, high = ends_of(cloud[:, :2])
-    return np.asarray(((own[:, :2] >= low) & (own[:, :2] <= high)).all(1))
+    return inside_box(own[:, :2], *ends_of(cloud[:, :2]))
 
 
 def _height_above(cloud: Array, own: Array) -> float:
@@ -255,12 +254,6 @@ def _seen(points: Array, views: list[View]) -> float:
     for view in views:
         count[view.visible(points)[0]] += 1
     return float((count >= CONFIRMING_PHOTOS).mean())
-
-
-def _in_box_of(points: Array, own: Array) -> Array:
-    """Those of a model's points (M, 3) that are in the box of a cloud (N, 3)."""
-    low, high = ends_of(points)
-    return own[((own >= low) & (own <= high)).all(1)]
 
 
 def _met(points: Array, own: Array, centres: Array) -> float:

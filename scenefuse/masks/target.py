@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull, Delaunay
 
 from scenefuse.cloud.cloud_file import STRAY_PERCENT
 from scenefuse.core.stage import StageError
-from scenefuse.core.transforms import Array
+from scenefuse.core.transforms import Array, inside_box
 from scenefuse.geometry.depth_test import CONFIRMING_PHOTOS
 from scenefuse.geometry.ground import Ground, fit_ground
 from scenefuse.geometry.surface import SCORE_FRACTION
@@ -137,7 +137,7 @@ def without_outermost(points: Array) -> Array:
         return points
     low = np.percentile(points, STRAY_PERCENT, axis=0, method="lower")
     high = np.percentile(points, 100 - STRAY_PERCENT, axis=0, method="higher")
-    return points[((points >= low) & (points <= high)).all(1)]
+    return points[inside_box(points, low, high)]
 
 
 def upright_box(points: Array, up: Array, margin: float) -> Box:

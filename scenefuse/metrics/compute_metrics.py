@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.cloud_file import strays
 from scenefuse.cloud.clouds import Cloud, parts, plane_normals, read_cloud, sampled, spacing
 from scenefuse.core.stage import quantity, read_json, threads, value, write_json
-from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.transforms import Array, Sim3, inside_box
 from scenefuse.fuse.compare import MARGIN
 from scenefuse.fuse.measure import SUPPORT
 from scenefuse.fuse.write import Source
@@ -144,9 +144,8 @@ def completion_of(before: Array, after: Cloud, source: int, diagonal: float) -> 
         source: the object's number in it.
         diagonal: of the full variant's crop.
     """
-    low, high = before.min(0), before.max(0)
     origin = after.fields["source"]
-    left = after.points[(origin == 0) & ((after.points >= low) & (after.points <= high)).all(1)]
+    left = after.points[(origin == 0) & inside_box(after.points, before.min(0), before.max(0))]
     # Fusion never moves what it keeps of the scene.
     still = cKDTree(left).query(before, workers=threads())[0] == 0 if len(left) else np.zeros(len(before), dtype=bool)
     return Completion(before, before[still], after.points[origin == source], diagonal)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import StageError, atomic_directory, read_json, value
-from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
+from scenefuse.core.transforms import UP, Array, Sim3, inside_box, rotation_between
 from scenefuse.fuse.fuse_object import is_placed
 from scenefuse.fuse.missing import Lack
 from scenefuse.fuse.write import after_fusion
@@ -327,7 +327,7 @@ def upright(cloud: Cloud, workspace: Path) -> Cloud:
 def inner(points: Array, limit: int = 20000) -> Array:
     """At most that many of the points, without the outermost half per cent of each axis: what a picture has to show."""
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
-    return points[((points >= low) & (points <= high)).all(1)][:: max(1, len(points) // limit)]
+    return points[inside_box(points, low, high)][:: max(1, len(points) // limit)]
 
 
 def read_surroundings(inputs: FigureInputs) -> Surroundings:
@@ -345,7 +345,7 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
     reach = REACH * float(np.linalg.norm(high - low))
     scene, box = open_cloud(inputs.scene), (low - reach, high + reach)
     clouds = scene.near(*box)[1], after_fusion(scene, inputs.checked, inputs.fused, *box)
-    before, after = brightened(*(cloud[within(cloud.points, low, high, REACH)] for cloud in clouds))
+    before, after = brightened(*(cloud[inside_box(cloud.points, *box)] for cloud in clouds))
     if not len(before):
         raise StageError(
             f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"

@@ -31,7 +31,7 @@ from scenefuse.cloud.clouds import (
 )
 from scenefuse.cloud.tiled_cloud import MORTON_BITS, morton
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
-from scenefuse.core.transforms import Array
+from scenefuse.core.transforms import Array, inside_box
 from scenefuse.report.render import brightened, luminance, point_radii
 
 Bytes = NDArray[np.uint8]
@@ -149,8 +149,7 @@ def thin(points: Cloud, limit: int) -> Cloud:
 
 def within(points: Array, low: Array, high: Array, margin: float = 0.05) -> NDArray[np.bool_]:
     """(N,) whether points lie in a box that is widened by a share of its diagonal."""
-    wider = margin * float(np.linalg.norm(np.subtract(high, low)))
-    return np.asarray(((points >= low - wider) & (points <= high + wider)).all(1))
+    return inside_box(points, low, high, margin * float(np.linalg.norm(np.subtract(high, low))))
 
 
 def _not_in(keys: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
