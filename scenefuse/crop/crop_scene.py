@@ -106,18 +106,17 @@ def crop_of(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tu
         cut = whole(near)
         print(cut.notes[0], flush=True)
         return near, cut, Marks("none", np.zeros((0, 3)))
-    linked = settings.mode == "masks" and alignment is not None
-    if linked and (found or inputs.fiducials is None):
+    if settings.mode != "masks" or alignment is None:
+        return crop_by_file(scene, inputs, settings)
+    if found or inputs.fiducials is None:
         return crop_linked(scene, inputs, settings)
     near, cut, marks = crop_by_file(scene, inputs, settings)
-    if alignment is not None and linked:
-        note = (
-            f"marked by {inputs.fiducials}: shared features give no alignment of the object with the scene"
-            f" ({value(alignment, 'reason')})"
-        )
-        print(note, flush=True)
-        cut = replace(cut, notes=[note, *cut.notes])
-    return near, cut, marks
+    note = (
+        f"marked by {inputs.fiducials}: shared features give no alignment of the object with the scene"
+        f" ({value(alignment, 'reason')})"
+    )
+    print(note, flush=True)
+    return near, replace(cut, notes=[note, *cut.notes]), marks
 
 
 def around_marks(marks: Array, settings: CropSettings, extents: float = 1.0) -> tuple[Array, Array]:
