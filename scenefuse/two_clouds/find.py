@@ -49,10 +49,8 @@ class RegistrationSettings:
     """Settings of all steps."""
 
     crop: CropSettings = CropSettings()
-    scale: ScaleSettings = ScaleSettings()
     coarse: CoarseSettings = CoarseSettings()
     fine: FineSettings = FineSettings()
-    agreement: AgreementSettings = AgreementSettings()
 
     @classmethod
     def read(cls, path: Path | None) -> tuple["RegistrationSettings", int]:
@@ -186,7 +184,7 @@ def search(
     origins = np.floor(obj.points.mean(0)), np.floor(scene.points.mean(0))
     near_obj, near_scene = (_searched(cloud, at, seed) for cloud, at in zip((obj, scene), origins))
     if scales is None:
-        scales = prior(estimates(near_obj, near_scene, ups), settings.scale)
+        scales = prior(estimates(near_obj, near_scene, ups), ScaleSettings())
     problem = Problem(*comparable(near_obj, near_scene), scales, Constraints(ups), seed)
     return Search(problem, origins, find_hypotheses(problem, settings.coarse))
 
@@ -215,14 +213,12 @@ def _fitting_scale(problem: Problem, pose: Sim3, fraction: float) -> tuple[float
     return (found[0].scale, found[0].scale * deviation) if off else None
 
 
-def with_agreement(
-    found: Registration, obj: Cloud, scene: Cloud, settings: RegistrationSettings, seed: int
-) -> Registration:
+def with_agreement(found: Registration, obj: Cloud, scene: Cloud, seed: int) -> Registration:
     """A registration with how well both clouds agree at its pose."""
     if found.outcome is None:
         return found
     near_obj, near_scene = (_searched(cloud, at, seed) for cloud, at in zip((obj, scene), found.origins))
-    tau, diagonal = settings.agreement.tau_fraction * near_scene.diagonal, near_scene.diagonal
+    tau, diagonal = AgreementSettings().tau_fraction * near_scene.diagonal, near_scene.diagonal
     pose = found.outcome.ranked[0].pose
     return replace(found, agreement=registration_metrics(near_obj, near_scene, pose, tau, diagonal, found.unit))
 
@@ -306,7 +302,7 @@ def find_in_scene(
             return replace(other, sides_estimated=True), where, places
     ranked = sorted((one for one in tried if one[1] is not scene), key=lambda one: -one[0].total)
     places = [(one.total, np.stack([there.points.min(0), there.points.max(0)])) for one, there in ranked]
-    return with_agreement(found, obj, part, settings, seed), part, places
+    return with_agreement(found, obj, part, seed), part, places
 
 
 def _is_inward(cloud: Cloud) -> bool:

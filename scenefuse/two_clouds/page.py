@@ -13,12 +13,12 @@ from PIL import Image
 
 from scenefuse.cloud.clouds import Cloud, voxel_downsample
 from scenefuse.core.stage import atomic_file, value
-from scenefuse.core.transforms import UP, Array, Sim3, rotation_between
+from scenefuse.core.transforms import UP, Array, Sim3, inside_box, rotation_between
 from scenefuse.photos.sheets import TILE_PX
 from scenefuse.report.page import document, figure, view_section, webp
 from scenefuse.report.render import Camera, point_radii, render
 from scenefuse.report.values import asset, flatten, number
-from scenefuse.report.view import REACH, View, view_of, within
+from scenefuse.report.view import REACH, View, view_of
 from scenefuse.two_clouds.complete import Completed
 
 ROWS = {
@@ -142,7 +142,7 @@ def view_of_scene(name: str, done: Completed, up: Array | None, unit: str) -> Vi
     level = level @ Sim3(1.0, np.eye(3), -middle)
     reach = (0.5 + REACH) * float(np.linalg.norm(corners[1] - corners[0]))
     before, after = (
-        cloud[within(cloud.points, middle - reach, middle + reach, margin=0.0)].transformed(level)
+        cloud[inside_box(cloud.points, middle - reach, middle + reach)].transformed(level)
         for cloud in (done.before, done.after)
     )
     low, high = np.percentile(added.transformed(level).points, [0.5, 99.5], axis=0)
