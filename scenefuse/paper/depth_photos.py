@@ -56,16 +56,10 @@ def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhoto
     """Views as tensors, with depth range and source photos; errors as of `points_on_object`."""
     known = points_on_object(views, sources)
     low, high = ends_of(views.sparse[np.unique(np.concatenate(known.ids))])
-
-    def as_tensor(array: NDArray[np.generic]) -> Tensor:
-        return torch.as_tensor(array, dtype=torch.float32, device=device)
-
     pairs = list(zip(known.ids, known.pixels))
     return DepthPhotos(
-        as_tensor(views.images).permute(0, 3, 1, 2).contiguous() / 255.0,
-        as_tensor(views.masks)[:, None],
-        as_tensor(views.intrinsics),
-        as_tensor(views.object_from_cam),
+        *pictures(views, device),
+        torch.as_tensor(views.object_from_cam, dtype=torch.float32, device=device),
         ~views.held_out,
         torch.as_tensor(known.sources, device=device),
         [pixels[ids % CHECK_EVERY != 0] for ids, pixels in pairs],
@@ -73,6 +67,15 @@ def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhoto
         float(known.near.min()),
         float(np.linalg.norm(high - low)),
     )
+
+
+def pictures(views: Views, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """The (V, 3, H, W) images in 0..1, (V, 1, H, W) masks and (V, 3, 3) intrinsics of views."""
+    images, masks, intrinsics = (
+        torch.as_tensor(array, dtype=torch.float32, device=device)
+        for array in (views.images, views.masks, views.intrinsics)
+    )
+    return images.permute(0, 3, 1, 2).contiguous() / 255.0, masks[:, None], intrinsics
 
 
 def align_maps(raw: Tensor, photos: DepthPhotos) -> Tensor:

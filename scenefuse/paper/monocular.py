@@ -19,7 +19,7 @@ from scenefuse.core.stage import StageError, quantity, setting
 from scenefuse.core.transforms import Array, rotation_angle_deg
 from scenefuse.mvs.plane_sweep import MIN_TEXTURE
 from scenefuse.nerf.rendered_maps import MAP_AGREEMENT
-from scenefuse.paper.depth_photos import DepthPhotos, residual_at_checks
+from scenefuse.paper.depth_photos import DepthPhotos, pictures, residual_at_checks
 from scenefuse.paper.monodepth import (
     NEAR,
     DepthNetwork,
@@ -150,17 +150,10 @@ def frames_of(views: Views, device: torch.device) -> DepthPhotos:
             f"only {(~views.held_out).sum()} frames with a mask can be trained on; the pose network needs at least 3: "
             "take more photos around the object, or set object.hold_out_every to 0"
         )
-    count = len(views.names)
-
-    def as_tensor(array: NDArray[np.generic]) -> Tensor:
-        return torch.as_tensor(array, dtype=torch.float32, device=device)
-
-    nothing = [np.zeros((0, 3), np.float32)] * count
+    nothing = [np.zeros((0, 3), np.float32)] * len(views.names)
     frames = DepthPhotos(
-        as_tensor(views.images).permute(0, 3, 1, 2).contiguous() / 255.0,
-        as_tensor(views.masks)[:, None],
-        as_tensor(views.intrinsics),
-        torch.eye(4, device=device).repeat(count, 1, 1),
+        *pictures(views, device),
+        torch.eye(4, device=device).repeat(len(views.names), 1, 1),
         ~views.held_out,
         torch.as_tensor(neighbours(~views.held_out), device=device),
         nothing,
