@@ -176,7 +176,7 @@ def length_unit(georeference: Path | None) -> str:
 
 
 def frame_notes(georeference: Path | None) -> list[str]:
-    """What the coordinates of a scene's files are, for headers in ASCII: unit, origin, CRS, heights."""
+    """What the coordinates of a scene's files are, for headers in ASCII: unit, origin, CRS, heights, the way there."""
     known = {} if georeference is None else {name: entry["value"] for name, entry in read_json(georeference).items()}
     unit, crs = known.get("length_unit", "scene units"), known.get("crs")
     notes = [f"x y z: {'metres' if unit == 'm' else unit}"]
@@ -188,7 +188,8 @@ def frame_notes(georeference: Path | None) -> list[str]:
         notes[0] += f" {place} in {crs_name(crs) if crs else 'the coordinates of the given cloud'}"
     if crs and "origin_latitude_deg" in known:
         heights = heights_of(crs, known.get("control_points"), known.get("origin_altitude_m"), given_place(known))
-        notes += [f"heights: {heights}"]
+        apart = "not by adding the origin, for the grid's north is another; completed.copc.laz is in it"
+        notes += [f"heights: {heights}", f"into the CRS: {apart}"]
     return [" ".join(note.encode("ascii", "replace").decode().split()) for note in notes]
 
 

@@ -175,7 +175,8 @@ def surface_facts(folder: Path, row: Row) -> dict[str, str]:
     if not is_current(folder / "drawings/drawings.pdf", folder / "surface.json"):
         return {"Mesh": mesh}
     above = f"; above.tif beside it, for QGIS, is in {crs_name(has['crs'])}" if "crs" in has else ""
-    return {"Mesh": mesh, "Drawings": f"{place}/drawings/drawings.pdf, to scale{above}"}
+    scale = "with scale bars, to no scale in metres" if unit == "scene units" else "to scale"
+    return {"Mesh": mesh, "Drawings": f"{place}/drawings/drawings.pdf, {scale}{above}"}
 
 
 def accuracies(row: Row) -> list[str]:
@@ -186,7 +187,7 @@ def accuracies(row: Row) -> list[str]:
         if name in has:
             found.append(f"{length(has[name], unit)} {what}")
             if f"{name}_90" in has:
-                found[-1] += f", at most {length(has[f'{name}_90'], unit)} for nine points in ten"
+                found[-1] += f"; that of nine points in ten is at most {length(has[f'{name}_90'], unit)}"
     if has.get("scale_sd_log"):
         found.append(f"its size beside the scene's is known to {percent(has['scale_sd_log'])}")
     for kind, what in WORDS["errors"].items():
@@ -297,8 +298,8 @@ def made_by(summary: Path) -> str:
 
 
 def title_of(objects: Sequence[Path]) -> str:
-    """The project's folder and what was completed in it."""
-    return ": ".join(filter(None, [Path.cwd().name, named([folder.name for folder in objects])]))
+    """The project's folder and what was completed in it; a name that both have once."""
+    return ": ".join(dict.fromkeys(filter(None, [Path.cwd().name, named([folder.name for folder in objects])])))
 
 
 def closing_lines(summary: Path) -> str:

@@ -100,10 +100,12 @@ def test_headers_of_the_clouds_name_their_frame_and_readers_pass_over_that(tmp_p
     assert np.array_equal(whole.points, plain.points) and whole.fields.keys() == plain.fields.keys()
     for name in ("completed.ply", "left/fused.ply", "left/checked.ply"):
         header = (tmp_path / name).read_bytes().split(b"end_header")[0].decode("ascii").splitlines()
-        assert header[2:4] == [
+        assert header[2:5] == [
             "comment x y z: metres east, north, up of 500000 5260875.25 470 in ETRS89 / UTM zone 32N + DHHN2016 height"
             " (EPSG:25832+7837)",
             "comment heights: DHHN2016 height",
+            "comment into the CRS: not by adding the origin, for the grid's north is another;"
+            " completed.copc.laz is in it",
         ]
         assert "comment x y z: scene units in a local frame" in (tmp_path / "plain" / name).read_bytes().decode(
             "latin1"

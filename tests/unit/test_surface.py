@@ -833,6 +833,8 @@ def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_int
     for age, listed in ((10, False), (-10, True)):
         os.utime(pdf, (made - age, made - age))
         assert ("Drawings" in surface_facts(tmp_path, {})) == listed
+    assert surface_facts(tmp_path, {})["Drawings"].endswith("drawings.pdf, to scale")
+    assert surface_facts(tmp_path, {"unit": "scene units"})["Drawings"].endswith("scale bars, to no scale in metres")
     named = surface_facts(tmp_path, {"crs": pyproj.CRS("EPSG:25832+7837").to_wkt("WKT1_GDAL")})["Drawings"]
     assert named.endswith("above.tif beside it, for QGIS, is in ETRS89 / UTM zone 32N + DHHN2016 height")
 
