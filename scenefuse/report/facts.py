@@ -398,7 +398,8 @@ def diagnose(item: ObjectSummary) -> list[str]:
         found = find(item.stages, name)
         return otherwise if found is None else found
 
-    lost = set(known("sparse.not_registered", []))
+    doubtful = known("sparse.doubtful_photos", {})
+    lost = set(known("sparse.not_registered", [])) - set(doubtful)
     groups = list[str]()
     for model in known("sparse.models_left_out", []):
         if group := sorted(lost & set(model["photos"])):
@@ -408,7 +409,7 @@ def diagnose(item: ObjectSummary) -> list[str]:
         say("apart", groups, "; ")
     if lost:
         say("lost", sorted(lost))
-    if doubtful := known("sparse.doubtful_photos", {}):
+    if doubtful:
         say("doubtful", sorted(doubtful))
     if (gap := known("undistorted.largest_gap_deg", 0.0)) > MAX_GAP_DEG:
         first, second = known("undistorted.gap_between", ("?", "?"))

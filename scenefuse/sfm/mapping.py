@@ -4,6 +4,7 @@ He et al. 2026, section on the scene: bundle adjustment with 100 iterations, 200
 """
 
 import contextlib
+import copy
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from scenefuse.core.stage import (
     scratch_directory,
     setting,
     threads,
+    value,
     write_json,
 )
 from scenefuse.marks.triangulation import read_lengths
@@ -39,7 +41,7 @@ from scenefuse.sfm.colmap import (
     require_database,
 )
 from scenefuse.sfm.given_cameras import triangulated
-from scenefuse.sfm.lens import DISTORTED, HELD, KNOWN, Lens, choose_lens
+from scenefuse.sfm.lens import DISTORTED, HELD, KNOWN, Choice, Lens, choose_lens
 
 # All cameras are adjusted together when there are so many times the photos or points of the last time; by COLMAP's 1.1
 # that is 60 % of a mapping, and the last adjustment ends at the same cameras.
@@ -151,12 +153,13 @@ def in_metres(
 def _mapped(job: Job, calibrated: bool, seed: int) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
     """The model of photos by name, and what it is, as quantities: of a few attempts the one that explains most matches.
 
-    One attempt is enough where no photo is doubtful. A further one that registers too few photos is left out.
+    One attempt is enough where no photo is doubtful. A further one that registers too few photos is left out. Photos
+    that are doubtful in the best one are left out where enough others remain.
     """
-    attempts: list[tuple[int, pycolmap.Reconstruction, dict[str, Any]]] = []
+    attempts: list[tuple[int, pycolmap.Reconstruction, Choice, dict[str, Any]]] = []
     for attempt in range(ATTEMPTS):
         try:
-            model, content = _attempt(job, calibrated, seed + attempt)
+            model, choice, content = _attempt(job, calibrated, seed + attempt)
         except StageError as error:
             if not attempts:
                 raise
@@ -166,25 +169,35 @@ def _mapped(job: Job, calibrated: bool, seed: int) -> tuple[pycolmap.Reconstruct
         doubtful = doubtful_photos(model, found)
         content["doubtful_photos"] = quantity(doubtful, "1")
         content["notes"] = quantity([_doubt(doubtful)] if doubtful else [], "")
-        attempts.append((found.total, model, content))
+        attempts.append((found.total, model, choice, content))
         if not doubtful:
             break
         print(f"attempt {attempt + 1} of {ATTEMPTS}: {_doubt(doubtful)}", flush=True)
-    _, model, content = max(attempts, key=lambda attempt: attempt[0])
+    _, model, choice, content = max(attempts, key=lambda attempt: attempt[0])
+    if doubtful := value(content, "doubtful_photos"):
+        rest = copy.deepcopy(model)
+        for image in [rest.images[i] for i in rest.reg_image_ids()]:
+            if image.name in doubtful:
+                rest.deregister_frame(image.frame_id)
+        if _are_enough(rest, job):
+            # They bend what holds them.
+            model = choice.lens.fit(rest)
+            drop_outliers(model)
+            content |= _describe(model, job.names, *choice)
     return model, content | {"attempts": quantity(attempt + 1, "1")}
 
 
-def _attempt(job: Job, calibrated: bool, seed: int) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
-    """The model that one seed gives, and what it is, as quantities."""
+def _attempt(job: Job, calibrated: bool, seed: int) -> tuple[pycolmap.Reconstruction, Choice, dict[str, Any]]:
+    """The model that one seed gives, its lens, and what it is, as quantities."""
     ranked, least_matches = _mapped_first(job, calibrated, seed)
     _check_registered(ranked, job)
-    lens, beyond = choose_lens(ranked[0], (KNOWN,) if calibrated else DISTORTED)
-    mappings = 1
+    choice = choose_lens(ranked[0], (KNOWN,) if calibrated else DISTORTED)
+    lens, mappings = choice.lens, 1
     if lens not in (HELD, KNOWN):
         ranked, mappings = _with_lens(ranked, lens, job, _mapper_options(job, True, seed, least_matches))
     model = lens.fit(ranked[0])
     drop_outliers(model)
-    summary = _describe(model, job.names, lens, beyond)
+    summary = _describe(model, job.names, *choice)
     print(
         f"{summary['registered']['value']} of {len(job.names)} photos registered, "
         f"{summary['mean_reprojection_error_px']['value']:.3f} px, {summary['points']['value']} points, "
@@ -195,12 +208,13 @@ def _attempt(job: Job, calibrated: bool, seed: int) -> tuple[pycolmap.Reconstruc
     left_out = [{"photos": sorted(_registered_names(m)), "reason": reason} for m in ranked[1:]]
     for entry in left_out:
         print(f"note: a separate model of {len(entry['photos'])} photos is left out", flush=True)
-    return model, {
+    report = {
         **summary,
         "mappings": quantity(mappings, "1"),
         "least_matches_of_a_pair": quantity(least_matches, "1"),
         "models_left_out": quantity(left_out, ""),
     }
+    return model, choice, report
 
 
 def _mapped_first(job: Job, calibrated: bool, seed: int) -> tuple[list[pycolmap.Reconstruction], int]:
@@ -341,7 +355,7 @@ def _mapper_options(
 def _check_registered(models: list[pycolmap.Reconstruction], job: Job, given: Path | None = None) -> None:
     """StageError when the largest model, or that of the given cameras, holds too few of the photos."""
     count = models[0].num_reg_images() if models else 0
-    if count >= MIN_PHOTOS and count >= job.share * len(job.names):
+    if models and _are_enough(models[0], job):
         return
     others = f" (and {len(models) - 1} separate smaller models)" if len(models) > 1 else ""
     missing = sorted(set(job.names) - (_registered_names(models[0]) if models else set()))
@@ -353,6 +367,11 @@ def _check_registered(models: list[pycolmap.Reconstruction], job: Job, given: Pa
         f"{what}, fewer than the share of {job.share:g} that min_registered_share requires; without one: {some}. "
         + (GIVEN_ADVICE if given else MAPPING_ADVICE)
     )
+
+
+def _are_enough(model: pycolmap.Reconstruction, job: Job) -> bool:
+    """Whether a model holds so many photos that it is of use."""
+    return bool(model.num_reg_images() >= max(MIN_PHOTOS, job.share * len(job.names)))
 
 
 def _registered_names(model: pycolmap.Reconstruction) -> set[str]:

@@ -717,6 +717,20 @@ def test_a_photo_in_a_wrong_place_is_named(tmp_path):
     assert list(doubtful_photos(model, explained_matches(model, tmp_path / "database.db"))) == [moved.name]
 
 
+def test_a_photo_in_a_wrong_place_is_left_out_where_enough_others_remain(tmp_path, monkeypatch):
+    small_capture(tmp_path)
+    name = mapping.read_photos(tmp_path / "photos.json")[2].name
+    monkeypatch.setattr(mapping, "doubtful_photos", lambda *_: {name: 0.5})
+    report = mapped(tmp_path)
+    model = pycolmap.Reconstruction(tmp_path / "sparse")
+    assert name not in {model.images[i].name for i in model.reg_image_ids()} and model.num_points3D()
+    assert value(report, "registered") == 7 and value(report, "not_registered") == [name]
+    assert all(len(point.track.elements) > 1 for point in model.points3D.values())
+    monkeypatch.setattr(mapping, "doubtful_photos", lambda model, _: {i.name: 0.5 for i in model.images.values()})
+    report = mapped(tmp_path)
+    assert value(report, "registered") == 8 == len(value(report, "doubtful_photos"))
+
+
 def test_a_further_attempt_that_fails_loses_nothing(tmp_path, monkeypatch, capsys):
     small_capture(tmp_path)
     asked, choose = [], mapping.choose_lens
