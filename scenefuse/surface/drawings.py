@@ -211,7 +211,7 @@ def draw_surface(
                 drawn = replace(whole, vertices=replace(vertices, points=points, fields=fields))
                 shown = None if painted is None else replace(painted, points=frame.in_crs(painted.points) - shift)
             drawing = draw(drawn, shown, axes, ratio * pixel_of(whole, painted))
-            _write_bands(output / side, drawing, crs, shift)
+            _write_bands(output / side, drawing, crs, shift, counted)
             towards = f", looking towards {np.degrees(np.arctan2(-axes[2, 0], -axes[2, 1])) % 360:.0f}°"
             towards += "" if has_north else ", y taken for north"
             if abs(axes[2] @ UP) > 1 - MARGIN:
@@ -253,8 +253,9 @@ def pixel_of(surface: Surface, painted: Painted | None) -> float:
     return float(np.sqrt(area / np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()))
 
 
-def _write_bands(path: Path, drawing: Drawing, crs: str | None, shift: Array) -> None:
-    """PATH.tif and its bands, cloud-optimised GeoTIFFs, in the CRS where there is one."""
+def _write_bands(path: Path, drawing: Drawing, crs: str | None, shift: Array, unit: str) -> None:
+    """PATH.tif and its bands, cloud-optimised GeoTIFFs, in the CRS where there is one; each says what it holds."""
+    towards = "height" if path.name == "above" else "distance towards the viewer"
     height, width = drawing.classes.shape
     plane = {
         "transform": Affine(drawing.pixel, 0, drawing.left + shift[0], 0, -drawing.pixel, drawing.top + shift[1]),
@@ -263,17 +264,20 @@ def _write_bands(path: Path, drawing: Drawing, crs: str | None, shift: Array) ->
         "compress": "deflate",
         "overview_resampling": "nearest",
     }
-    for ending, band, nothing in (
-        ("", np.moveaxis(drawing.colors, 2, 0), None),
-        ("_height", (drawing.heights + np.float32(shift[2]))[None], np.nan),
-        ("_class", drawing.classes[None], NOTHING),
-        ("_deviation", drawing.deviations[None], np.nan),
+    classes = ", ".join(f"{kind} {kind.name.lower()}" for kind in FaceClass)
+    for ending, band, nothing, said in (
+        ("", np.moveaxis(drawing.colors, 2, 0), None, ""),
+        ("_height", (drawing.heights + np.float32(shift[2]))[None], np.nan, f"{towards} ({unit})"),
+        ("_class", drawing.classes[None], NOTHING, classes),
+        ("_deviation", drawing.deviations[None], np.nan, f"standard deviation ({unit})"),
     ):
         shape = {"count": len(band), "height": height, "width": width, "dtype": band.dtype, "nodata": nothing}
         with rasterio.open(f"{path}{ending}.tif", "w", **shape, **plane) as file:
             file.write(band)
             if len(band) == 4:
                 file.colorinterp = COLORS
+            else:
+                file.set_band_description(1, said)
 
 
 def _scale(drawing: Drawing, metres: float, unit: str) -> float:

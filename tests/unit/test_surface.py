@@ -394,6 +394,10 @@ def test_an_elevation_has_the_scale_that_it_says(drawings):
         middle = np.argwhere(shown).mean(0) + 0.5
         assert [left + middle[1] * pixel, top - middle[0] * pixel] == pytest.approx([0, 0], abs=pixel)
     assert np.nanmax(rasterio.open(drawings / "above_height.tif").read(1)) == pytest.approx(1, abs=0.01)
+    said = ["height (scene units)", "distance towards the viewer (scene units)", "standard deviation (scene units)"]
+    bands = ["above_height", "south_height", "south_deviation"]
+    assert [rasterio.open(drawings / f"{band}.tif").descriptions[0] for band in bands] == said
+    assert "1 measured, 2 bridged" in rasterio.open(drawings / "south_class.tif").descriptions[0]
     # What photos do not confirm is below.
     assert (rasterio.open(drawings / "above_class.tif").read(1) != FaceClass.UNCONFIRMED).mean() > 0.97
     assert (drawings / "drawings.pdf").read_bytes()[:4] == b"%PDF"
