@@ -3,10 +3,9 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyproj
 
 from scenefuse.cloud.cloud_file import (
     STRAY_PERCENT,
@@ -17,12 +16,14 @@ from scenefuse.cloud.cloud_file import (
     without_strays,
 )
 from scenefuse.cloud.clouds import Cloud, cloud_of, concatenate, spacing, write_cloud
-from scenefuse.cloud.crs import check_place, plane, projected_crs, registered, unit_name, usable
 from scenefuse.cloud.readers.columns import Columns
 from scenefuse.cloud.readers.las import LAS_DIMENSIONS, WITHHELD, las_crs, las_dimensions
 from scenefuse.cloud.tiled_cloud import open_cloud, write_tiled
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Array, Sim3
+
+if TYPE_CHECKING:
+    import pyproj
 
 # Fewer different points give no features to register by.
 MIN_POINTS = 200
@@ -54,6 +55,8 @@ def import_scene_cloud(
     unit, name = unit_and_name(own)
     _check_axes(own, source)
     if own is not None:
+        from scenefuse.cloud.crs import check_place
+
         check_place(own, sample, source)
     origin = near_origin(sample)
     shift = Sim3(1.0, np.eye(3), origin)
@@ -68,11 +71,13 @@ def import_scene_cloud(
     write_json(georeference_json, place)
 
 
-def crs_of(source: Path, said: str | None) -> pyproj.CRS | None:
+def crs_of(source: Path, said: str | None) -> "pyproj.CRS | None":
     """The CRS of a file: its own, or the one that a user says, perhaps with heights that the file does not know."""
     known = las_crs(source)
     if said is None:
         return known
+    from scenefuse.cloud.crs import plane, projected_crs, registered
+
     crs = projected_crs(said, f"the column crs for {source.name}", heights=True)
     own = None if known is None else registered(known)
     if own is not None and (plane(own) != plane(crs) or (own.is_compound and own != crs)):
@@ -80,9 +85,11 @@ def crs_of(source: Path, said: str | None) -> pyproj.CRS | None:
     return crs
 
 
-def _check_axes(crs: pyproj.CRS | None, source: Path) -> None:
+def _check_axes(crs: "pyproj.CRS | None", source: Path) -> None:
     """StageError where the axes of a file's CRS stretch or mirror what lies in it (`crs.usable`)."""
     if crs is not None:
+        from scenefuse.cloud.crs import usable
+
         usable(crs, str(source), local=True)
 
 
@@ -223,8 +230,10 @@ class ImportedFile:
         }
 
 
-def unit_and_name(crs: pyproj.CRS | None) -> tuple[str, str | None]:
+def unit_and_name(crs: "pyproj.CRS | None") -> tuple[str, str | None]:
     """The unit of a projected CRS (`unit_name`), and its name: an EPSG code where it has one, else its WKT."""
     if crs is None:
         return "scene units", None
+    from scenefuse.cloud.crs import unit_name
+
     return unit_name(crs), crs.to_string()

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import MAX_STEP, Cloud, file_names, spacing
@@ -68,6 +67,7 @@ class LasLayout:
         """For clouds of `like`'s columns in a box between two corners (3,) relative to `origin`; much closer than a
         millimetre, points that lie `apart` ask for finer steps."""
         import laspy
+        import pyproj
 
         header = laspy.LasHeader(point_format=6 if like.colors is None else 7, version="1.4")
         header.generating_software = f"scenefuse {VERSION}"

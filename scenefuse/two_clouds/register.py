@@ -13,7 +13,6 @@ import tyro
 
 from scenefuse.cloud.cloud_file import CloudFile, normals_fault, without_strays
 from scenefuse.cloud.clouds import Cloud, write_cloud
-from scenefuse.cloud.crs import check_place, mixed_units
 from scenefuse.cloud.import_cloud import MIN_POINTS, unit_and_name
 from scenefuse.cloud.readers.las import las_crs, las_dimensions
 from scenefuse.cloud.write_las import write_laz
@@ -226,6 +225,8 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     whole = CloudFile.of(scene, marked, MAX_SEARCHED_POINTS)
     crs = las_crs(scene)
     if crs is not None:
+        from scenefuse.cloud.crs import check_place
+
         check_place(crs, whole.summary.sample, scene)
     notes = [*cloud.notes, *strays, *whole.notes, *_notes(object, scene)]
     if unused := las_dimensions(object):
@@ -255,6 +256,8 @@ def _notes(object: Path, scene: Path) -> list[str]:
     own, other = las_crs(object), las_crs(scene)
     if own is None and other is None:
         return []
+    from scenefuse.cloud.crs import mixed_units
+
     notes = [
         f"{path} counts its plane and its heights in {units}, as its CRS says: no turned object fits; bring both into"
         " one unit"

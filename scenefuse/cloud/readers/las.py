@@ -4,14 +4,15 @@ import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyproj
 
-from scenefuse.cloud.crs import MERCATOR, is_stretched, with_units
 from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, POSITION, Columns, check_count
 from scenefuse.core.stage import StageError
+
+if TYPE_CHECKING:
+    import pyproj
 
 ENDINGS = (".las", ".laz")
 # What LAS says of a point that a scene's cloud keeps, and as what; of points that were measured otherwise both are 0.
@@ -23,7 +24,7 @@ WITHHELD = "withheld"
 ENDS = (np.iinfo(np.int32).min, np.iinfo(np.int32).max)
 
 
-def las_crs(path: Path) -> pyproj.CRS | None:
+def las_crs(path: Path) -> "pyproj.CRS | None":
     """The coordinate system of a LAS or LAZ file; None where it has none, and for any other file."""
     if path.suffix.lower() not in ENDINGS:
         return None
@@ -36,6 +37,8 @@ def las_crs(path: Path) -> pyproj.CRS | None:
 
 def check_projected(path: Path) -> None:
     """StageError where a LAS or LAZ file is in degrees, geocentric or stretched."""
+    from scenefuse.cloud.crs import MERCATOR, is_stretched
+
     crs = las_crs(path)
     if crs is not None and (crs.is_geocentric or crs.is_geographic or is_stretched(crs)):
         why = "geocentric coordinates, with z along the earth's axis" if crs.is_geocentric else "degrees"
@@ -135,8 +138,12 @@ def _check_header(path: Path) -> None:
         check_count(path, count, held)
 
 
-def _crs(header: Any) -> pyproj.CRS | None:
+def _crs(header: Any) -> "pyproj.CRS | None":
     """The CRS of a LAS header, or None; an entry that pyproj cannot read counts as none."""
+    from pyproj.exceptions import CRSError
+
+    from scenefuse.cloud.crs import with_units
+
     try:
         crs = header.parse_crs()
         keys = {
@@ -146,8 +153,8 @@ def _crs(header: Any) -> pyproj.CRS | None:
             if key.tiff_tag_location == 0
         }
         if crs is not None and crs.is_geographic and keys.get(1024) == 1:
-            raise pyproj.exceptions.CRSError(f"its keys name no number of a projected one, only its datum, {crs.name}")
+            raise CRSError(f"its keys name no number of a projected one, only its datum, {crs.name}")
         return crs if crs is None or not crs.is_projected or crs.is_compound else with_units(crs, keys)
-    except pyproj.exceptions.CRSError as error:
+    except CRSError as error:
         print(f"the file's coordinate system cannot be read and is ignored: {error}", flush=True)
         return None
