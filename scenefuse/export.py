@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile
 
@@ -140,17 +141,9 @@ def write_zip(page: Path, exported: Iterable[Path], file: Path) -> None:
     results, text = page.parent.parent, page.read_text(encoding="utf-8")
     given = {*exported, *(results / link for link in re.findall(r'href="\.\./([^"#]+)"', text))}
     files = {path for top in given for path in (top, *top.rglob("*")) if path.is_file() and path.name[0] != "."}
-    with (
-        atomic_file(file) as temporary,
-        ZipFile(
-            # A copy may have lost its files' dates.
-            temporary,
-            "w",
-            ZIP_DEFLATED,
-            compresslevel=1,
-            strict_timestamps=False,
-        ) as archive,
-    ):
+    # A copy may have lost its files' dates.
+    packed = partial(ZipFile, mode="w", compression=ZIP_DEFLATED, compresslevel=1, strict_timestamps=False)
+    with atomic_file(file) as temporary, packed(temporary) as archive:
         archive.writestr(page.name, text.replace('href="../', 'href="').replace(">results/", ">"))
         for path in sorted(files):
             # What belongs to the summary lies at the top, beside the page.
