@@ -94,6 +94,11 @@ def verdict(row: Row) -> str:
     return WORDS["badges"].get(has["status"], has["status"]) + _completed(has)
 
 
+def scene_title(name: str) -> str:
+    """A heading; a scene is often called so."""
+    return "Scene" if name.lower() == "scene" else f"Scene {name}"
+
+
 def _completed(has: dict[str, Any]) -> str:
     """How much of an object's surface is there, to follow the word "completed"."""
     known = has["status"] == "registered" and "surface_missing" in has and has.get("surface_of") in OF_ALL
@@ -170,13 +175,16 @@ def surface_facts(folder: Path, row: Row) -> dict[str, str]:
     of_glb = unit if unit == "scene units" else "metres"
     mesh = f"{place}/surface.ply (local frame, {unit}; for CloudCompare, MeshLab)"
     mesh += f", {place}/surface.glb (the same, {of_glb}, y up; for Blender, web viewers)"
-    if bridged := value(found, "bridged_area"):
-        mesh += f"; {length(bridged, found['bridged_area']['unit'].replace('2', '²'))} of it {WORDS['bridged']}"
+    area = sum(value(found, f"{kind}_area") for kind in ("measured", *WORDS["mesh"]))
+    whole = length(area, found["open_area"]["unit"].replace("2", "²"))
+    measured, _, *others = percents([value(found, kind) for kind in WORDS["mesh"]])
+    rest = [f"{share} {what}" for share, what in zip(others, WORDS["mesh"].values()) if share]
+    facts = {"Mesh": mesh, "Mesh area": ", ".join([f"{whole}: {measured} measured", *rest])}
     if not is_current(folder / "drawings/drawings.pdf", folder / "surface.json"):
-        return {"Mesh": mesh}
+        return facts
     above = f"; above.tif beside it, for QGIS, is in {crs_name(has['crs'])}" if "crs" in has else ""
     scale = "with scale bars, to no scale in metres" if unit == "scene units" else "to scale"
-    return {"Mesh": mesh, "Drawings": f"{place}/drawings/drawings.pdf, {scale}{above}"}
+    return facts | {"Drawings": f"{place}/drawings/drawings.pdf, {scale}{above}"}
 
 
 def accuracies(row: Row) -> list[str]:

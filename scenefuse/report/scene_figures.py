@@ -21,6 +21,7 @@ from scenefuse.photos.geodesy import length_unit, scene_frame
 from scenefuse.photos.sheets import TILE_PX, Cell, draw_scale, draw_sheet, save_png
 from scenefuse.photos.workspace import View as PhotoView
 from scenefuse.photos.workspace import read_views
+from scenefuse.report.facts import scene_title
 from scenefuse.report.render import MAX_DRAWN, Camera, brightened, orbit_camera, point_radii, render
 from scenefuse.report.values import read_table
 from scenefuse.report.view import view_of, within, write_view
@@ -69,7 +70,7 @@ def draw_scene(
     errors = pd.DataFrame() if residuals is None else read_table(residuals)
     frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
     place = length_unit(georeference_json), frame is not None and frame.has_north
-    save_png(figure, _scene_sheet(f"Scene {name}", note, cloud, views, boxes, errors, place))
+    save_png(figure, _scene_sheet(scene_title(name), note, cloud, views, boxes, errors, place))
 
 
 def _scene_sheet(

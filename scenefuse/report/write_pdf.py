@@ -13,7 +13,17 @@ from PIL import Image
 from scenefuse.core.stage import atomic_file, read_json, value
 from scenefuse.core.version import VERSION
 from scenefuse.photos.sheets import round_below
-from scenefuse.report.facts import ADDED, made_by, object_facts, rows_of, scene_facts, surface_facts, title_of, verdict
+from scenefuse.report.facts import (
+    ADDED,
+    made_by,
+    object_facts,
+    rows_of,
+    scene_facts,
+    scene_title,
+    surface_facts,
+    title_of,
+    verdict,
+)
 from scenefuse.report.values import length
 from scenefuse.surface.gltf import metres_per_unit
 
@@ -38,7 +48,7 @@ def write_pdf(
     page = _Page(title or title_of(objects), made_by(summary))
     page.start(page.project, f"{page.made} Files named here lie in the project's folder or the archive you were sent.")
     for row in rows_of(summary, "scene", scenes):
-        page.text_line(f"Scene {row['scene']}", 12)
+        page.text_line(scene_title(row["scene"]), 12)
         page.facts(scene_facts(row))
     page.text_line("Objects", 12)
     # What is missing is told apart on the object's own page.

@@ -18,6 +18,7 @@ from scenefuse.report.facts import (
     rows_of,
     scale_sd,
     scene_facts,
+    scene_title,
     surface_facts,
     title_of,
     verdict,
@@ -76,7 +77,7 @@ def write_report(
         f"<header><h1>{escape(title)}</h1><p>{escape(made_by(summary))} {texts['intro']}</p>",
         f"<nav>{links}</nav></header>",
         *(
-            f'<section class="scene"><h2>Scene {escape(row["scene"])}</h2>{_facts(scene_facts(row))}</section>'
+            f'<section class="scene"><h2>{escape(scene_title(row["scene"]))}</h2>{_facts(scene_facts(row))}</section>'
             for _, row in flown
         ),
         *(_object_card(folder, row, views.get(folder / "figures"), texts) for folder, row in shown),
@@ -161,7 +162,8 @@ def _slider(figures: Path) -> str:
 
 def _scene_card(folder: Path, row: Row, view: View | None, texts: Texts) -> str:
     """A scene with its objects in 3D, and its figure."""
-    parts = [f'<section class="card" id="scene-{escape(folder.name)}"><h2>Scene {escape(folder.name)} in pictures</h2>']
+    title = escape(scene_title(folder.name))
+    parts = [f'<section class="card" id="scene-{escape(folder.name)}"><h2>{title} in pictures</h2>']
     if view is not None:
         parts.append(view_section(f"scene-{folder.name}", f"scene {folder.name}", view, scale_sd=scale_sd(row)))
     # A given cloud has no cameras to show.

@@ -39,7 +39,7 @@ rule import_scene_cloud:
         script=script("cloud/import_scene_cloud.py"),
         code=code("cloud/import_scene_cloud.py"),
     message:
-        "Scene {wildcards.scene}: cloud of the table"
+        "{wildcards.scene}: cloud of the table"
     shell:
         "exec python {params.script} --source {params.source} {params.crs} --cloud {output.cloud} --report {output.report}"
         " --georeference-json {output.georeference} &> {log}"
@@ -105,7 +105,7 @@ rule import_posed_scene_cloud:
         script=script("georef/import_posed_cloud.py"),
         code=code("georef/import_posed_cloud.py"),
     message:
-        "Scene {wildcards.scene}: cloud of the table, with its photos"
+        "{wildcards.scene}: cloud of the table, with its photos"
     shell:
         "exec python {params.script} --source {params.source} {params.place} {params.crs}"
         " --cloud {output.cloud} --report {output.report} &> {log}"

@@ -169,7 +169,7 @@ rule evaluate_scene:
         script=script("demo/evaluate_scene.py"),
         code=code("demo/evaluate_scene.py"),
     message:
-        "Scene {wildcards.scene}: comparing with the truth"
+        "{wildcards.scene}: comparing with the truth"
     shell:
         "exec python {params.script} --model {input.model} --georeference-json {input.georeference} --cloud {input.cloud}"
         " --truth-scene {input.truth:q} --report {output} --seed {params.seed} &> {log}"

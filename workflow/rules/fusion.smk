@@ -115,7 +115,7 @@ rule complete_scene:
         script=script("fuse/complete_scene.py"),
         code=code("fuse/complete_scene.py"),
     message:
-        "Scene {wildcards.scene}: all objects in it"
+        "{wildcards.scene}: all objects in it"
     shell:
         "exec python {params.script} --scene {input.scene} --objects {params.objects} --georeference-json {input.georeference}"
         " --logs results/logs --benchmarks results/benchmarks --completed {output.cloud} --completed-copc {output.copc}"

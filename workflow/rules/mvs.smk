@@ -36,7 +36,7 @@ rule undistort_scene_photos:
         script=script("mvs/undistort_photos.py"),
         code=code("mvs/undistort_photos.py"),
     message:
-        "Scene {wildcards.scene}: undistorting"
+        "{wildcards.scene}: undistorting"
     shell:
         "exec python {params.script} --folder {input.folder} --photos {input.photos} --sparse {input.model} {params.upright}"
         " --workspace {output.workspace} --report {output.report} {params.options} &> {log}"
@@ -96,7 +96,7 @@ rule estimate_depth_maps:
         script=script("mvs/estimate_depth_maps.py"),
         code=code("mvs/estimate_depth_maps.py"),
     message:
-        "Scene {wildcards.scene}: depth maps, chunk {wildcards.chunk}"
+        "{wildcards.scene}: depth maps, chunk {wildcards.chunk}"
     shell:
         "exec python {params.script} --workspace {input.workspace} --chunk {wildcards.chunk} --chunks {params.chunks}"
         " --depth {output.depth} --report {output.report} --seed {params.seed} {params.options} &> {log}"
@@ -134,7 +134,7 @@ rule fuse_depth_maps:
         script=script("mvs/fuse_depth_maps.py"),
         code=code("mvs/fuse_depth_maps.py"),
     message:
-        "Scene {wildcards.scene}: dense cloud"
+        "{wildcards.scene}: dense cloud"
     shell:
         "exec python {params.script} --workspace {input.workspace} --depth {input.depth} --depth-json {input.depth_json}"
         " --georeference-json {input.georeference_json} --cloud {output.cloud} --report {output.report} {params.options} &> {log}"

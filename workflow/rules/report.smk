@@ -46,7 +46,7 @@ rule draw_scene:
         script=script("report/draw_scene.py"),
         code=code("report/draw_scene.py"),
     message:
-        "Scene {wildcards.scene}: figure"
+        "{wildcards.scene}: figure"
     shell:
         "exec python {params.script} --name {wildcards.scene} --dense {input.cloud} {params.cameras}"
         " --georeference-json {input.georeference} --objects {params.objects} --figure {output} &> {log}"
@@ -170,7 +170,7 @@ rule view_scene:
         script=script("report/view_scene.py"),
         code=code("report/view_scene.py"),
     message:
-        "Scene {wildcards.scene}: 3D view"
+        "{wildcards.scene}: 3D view"
     shell:
         "exec python {params.script} --dense {input.dense} --completed {input.completed} --completed-json {input.completed_json}"
         " --georeference-json {input.georeference} --folder results/scenes/{wildcards.scene} &> {log}"

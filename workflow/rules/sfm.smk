@@ -37,7 +37,7 @@ rule list_photos:
         files=state_of(scene_photos),
         code=code("photos/list_photos.py"),
     message:
-        "Scene {wildcards.scene}: checking the photos"
+        "{wildcards.scene}: checking the photos"
     shell:
         "exec python {params.script} --source {params.source} --upright {output.upright} --photos {output.photos} {params.options} &> {log}"
 
@@ -96,7 +96,7 @@ rule extract_scene_features:
         script=script("sfm/extract_features.py"),
         code=code("sfm/extract_features.py"),
     message:
-        "Scene {wildcards.scene}: features"
+        "{wildcards.scene}: features"
     shell:
         "exec python {params.script} --folder {input.folder} --photos {input.photos} --features {output} {params.calibration}"
         " {params.options} &> {log}"
@@ -153,7 +153,7 @@ rule match_scene_features:
         script=script("sfm/match_features.py"),
         code=code("sfm/match_features.py"),
     message:
-        "Scene {wildcards.scene}: matching"
+        "{wildcards.scene}: matching"
     shell:
         "exec python {params.script} --photos {input.photos} --features {input.features} --database {output.database}"
         " --matches {output.report} --seed {params.seed} {params.options} &> {log}"
@@ -215,7 +215,7 @@ rule map_scene_photos:
         script=script("sfm/map_photos.py"),
         code=code("sfm/map_photos.py"),
     message:
-        "Scene {wildcards.scene}: cameras and sparse points"
+        "{wildcards.scene}: cameras and sparse points"
     shell:
         "exec python {params.script} --folder {input.folder} --photos {input.photos} --database {input.database}"
         " --sparse {output.model} --report {output.report} --calibrated {params.calibrated} {params.cameras} {params.lengths} --seed {params.seed}"
@@ -290,7 +290,7 @@ rule georegister:
         script=script("georef/georegister.py"),
         code=code("georef/georegister.py"),
     message:
-        "Scene {wildcards.scene}: georeferencing"
+        "{wildcards.scene}: georeferencing"
     shell:
         "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --photos {input.photos} {params.survey}"
         " --held {params.held} {params.crs} {params.cloud} --georeferenced {output.model} --residuals {output.residuals} --report {output.report} --seed {params.seed} {params.options} &> {log}"
@@ -317,7 +317,7 @@ rule estimate_scene_spread:
         script=script("georef/estimate_spread.py"),
         code=code("georef/estimate_spread.py"),
     message:
-        "Scene {wildcards.scene}: how far the model may be bent"
+        "{wildcards.scene}: how far the model may be bent"
     shell:
         "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --spread {output} &> {log}"
 

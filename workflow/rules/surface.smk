@@ -95,7 +95,7 @@ rule export_cameras:
         script=script("surface/export_cameras.py"),
         code=code("surface/export_cameras.py"),
     message:
-        "Scene {wildcards.scene}: cameras of both sides"
+        "{wildcards.scene}: cameras of both sides"
     shell:
         "exec python {params.script} {params.photos} --objects {params.objects}"
         " --georeference-json {input.georeference} --folder {output} &> {log}"
@@ -124,7 +124,7 @@ rule make_tiles:
         script=script("surface/make_tiles.py"),
         code=code("surface/make_tiles.py"),
     message:
-        "Scene {wildcards.scene}: 3D Tiles"
+        "{wildcards.scene}: 3D Tiles"
     shell:
         "exec python {params.script} --cloud {input.cloud} --objects {params.objects}"
         " --georeference-json {input.georeference} --folder {output} &> {log}"
