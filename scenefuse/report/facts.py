@@ -179,7 +179,7 @@ def surface_facts(folder: Path, row: Row) -> dict[str, str]:
     whole = length(area, found["open_area"]["unit"].replace("2", "²"))
     measured, _, *others = percents([value(found, kind) for kind in WORDS["mesh"]])
     rest = [f"{share} {what}" for share, what in zip(others, WORDS["mesh"].values()) if share]
-    facts = {"Mesh": mesh, "Mesh area": ", ".join([f"{whole}: {measured} measured", *rest])}
+    facts = {"Mesh": mesh, "Mesh area": ", ".join([f"{whole} with its surroundings: {measured} measured", *rest])}
     if not is_current(folder / "drawings/drawings.pdf", folder / "surface.json"):
         return facts
     above = f"; above.tif beside it, for QGIS, is in {crs_name(has['crs'])}" if "crs" in has else ""

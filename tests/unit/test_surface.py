@@ -824,8 +824,8 @@ def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_int
     shares = {kind: quantity(area / 1000, "of the area") for kind, area in areas.items()}
     write_json(tmp_path / "surface.json", surface_report(closed, "m") | faces | shares)
     assert surface_facts(tmp_path, {})["Mesh area"] == (
-        "1,000 m²: 92.0 % measured, 5.0 % beside points that photos do not confirm, 1.0 % interpolated over narrow gaps"
-        " (purple in the drawings), 2.0 % left open as gaps"
+        "1,000 m² with its surroundings: 92.0 % measured, 5.0 % beside points that photos do not confirm, 1.0 %"
+        " interpolated over narrow gaps (purple in the drawings), 2.0 % left open as gaps"
     )
     # A run makes what was exported before again, also of an object that it refuses now.
     write_json(tmp_path / "fusion.json", {"status": quantity("unregistered", "")})
