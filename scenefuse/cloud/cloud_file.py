@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import (
+    NEIGHBOURS,
     Cloud,
     chosen_rows,
     cloud_of,
@@ -56,8 +57,6 @@ Box = tuple[Array, Array]
 Look = Callable[[Columns, Columns], None]
 # Points below this percentile along an axis, and above the same on the other side, do not say how far a cloud reaches.
 STRAY_PERCENT = 1.0
-# Neighbours of a point that has company.
-NEIGHBOURS = 8
 # A stray's neighbours are farther than this share of the cloud's diagonal, and than so many times the usual distance;
 # so many sizes of a cloud away from it, nothing is a part of it.
 MIN_STRAY_SHARE, MIN_STRAY_TIMES = 0.02, 10.0

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.formats import columns_in_parts
 from scenefuse.cloud.readers.columns import (
+    AT_ONCE,
     COLOR,
     MAX_ODD_SHARE,
     NORMAL,
@@ -27,10 +28,15 @@ from scenefuse.cloud.readers.columns import (
 )
 from scenefuse.cloud.readers.ply import Element, header_of
 from scenefuse.core.stage import StageError, atomic_file, threads
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import Array, Sim3
 
 # Share of the spacing of points, from which the steps of their coordinates show.
 MAX_STEP = 0.25
+# Neighbours of a point that has company.
+NEIGHBOURS = 8
+# A point is dropped where the mean distance of its neighbours, in pixels of its photo, is more than so many times the
+# cloud's median.
+OUTLIER_RATIO = 4.0
 
 
 @dataclass(frozen=True)
@@ -151,6 +157,17 @@ def within(points: NDArray[np.float64], others: NDArray[np.float64], reach: floa
     """(N,) which of (N, D) points have one of (M, D) others within reach."""
     away = cKDTree(others).query(points, distance_upper_bound=np.nextafter(reach, np.inf), workers=threads())[0]
     return np.isfinite(away)
+
+
+def near_others(points: Array, pixel: Array | float = 1.0) -> NDArray[np.bool_]:
+    """(N,) True where a point's neighbours are about as near as they are for the others, in sizes of its pixel (N,)."""
+    if len(points) <= NEIGHBOURS:
+        return np.ones(len(points), dtype=bool)
+    tree, distance = cKDTree(points), np.empty(len(points))
+    for rows in np.array_split(np.arange(len(points)), -(-len(points) // AT_ONCE)):
+        distance[rows] = tree.query(points[rows], k=NEIGHBOURS + 1, workers=threads())[0][:, 1:].mean(1)
+    distance /= pixel
+    return distance <= OUTLIER_RATIO * np.median(distance)
 
 
 def spacing(points: NDArray[np.float64], seed: int = 0, quantile: float = 0.5, cell: float = 0.0) -> float:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.cloud_file import MIN_STRAY_TIMES, NEIGHBOURS
-from scenefuse.cloud.clouds import Cloud, occupied_voxels, spacing, within
+from scenefuse.cloud.cloud_file import MIN_STRAY_TIMES
+from scenefuse.cloud.clouds import NEIGHBOURS, Cloud, occupied_voxels, spacing, within
 from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import FIXING_POINTS, UP, Array, Sim3

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.cloud_file import NEIGHBOURS
-from scenefuse.cloud.clouds import Cloud, concatenate, spacing, within
+from scenefuse.cloud.clouds import NEIGHBOURS, Cloud, concatenate, spacing, within
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.measure import RESOLUTION, Measured

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.cloud_file import NEIGHBOURS
-from scenefuse.cloud.clouds import Cloud, sampled_rows, spacing, voxel_average, voxels
+from scenefuse.cloud.clouds import NEIGHBOURS, Cloud, sampled_rows, spacing, voxel_average, voxels
 from scenefuse.cloud.readers.columns import AT_ONCE
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import UP, Array, Sim3

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.cloud_file import NEIGHBOURS
-from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, within
+from scenefuse.cloud.clouds import NEIGHBOURS, Cloud, concatenate, spacing, voxel_downsample, within
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, inside_box
 from scenefuse.fuse.compare import SAME_PLACE_SPACINGS

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from scenefuse.cloud.cloud_file import NEIGHBOURS
-from scenefuse.cloud.clouds import plane_normals
+from scenefuse.cloud.clouds import NEIGHBOURS, plane_normals
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import SD_OVER_MEDIAN, Array, Sim3, fit_sim3
 from scenefuse.geometry.surface import SAMPLED_POINTS, Pairs, Surface, color_gain, pair

@@ -12,13 +12,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from scenefuse.cloud.cloud_file import NEIGHBOURS
-from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
-from scenefuse.cloud.tiled_cloud import WHOLE, write_tiled
-from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, value, write_json
-from scenefuse.core.transforms import Array
+from scenefuse.cloud.clouds import Cloud, concatenate, near_others, spacing, voxel_downsample
+from scenefuse.cloud.tiled_cloud import write_tiled
+from scenefuse.core.stage import StageError, quantity, read_json, setting, value, write_json
 from scenefuse.geometry.consistency import DepthMap, Votes, back_project, neighbours, surface_points, vote
 from scenefuse.geometry.depth_test import MAX_PHOTOS
 from scenefuse.photos.geodesy import length_unit
@@ -27,9 +24,6 @@ from scenefuse.photos.workspace import View, read_views
 
 # Share of the measured pixels below which the cameras or the limits are probably wrong.
 MIN_FUSED_SHARE = 0.01
-# A point is dropped where the mean distance of its neighbours, in pixels of its photo, is more than so many times the
-# cloud's median.
-OUTLIER_RATIO = 4.0
 
 
 @dataclass(frozen=True)
@@ -196,14 +190,3 @@ def _points(own: DepthMap, votes: Votes) -> Cloud:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     fields = {"views": votes.agree[rows, columns] + np.uint16(1), "pixel": depth[:, 0] / own.view.intrinsics[0, 0]}
     return Cloud(points, normals, np.rint(colors).astype(np.uint8), fields)
-
-
-def near_others(points: Array, pixel: Array | float = 1.0) -> NDArray[np.bool_]:
-    """(N,) True where a point's neighbours are about as near as they are for the others, in sizes of its pixel (N,)."""
-    if len(points) <= NEIGHBOURS:
-        return np.ones(len(points), dtype=bool)
-    tree, distance = cKDTree(points), np.empty(len(points))
-    for rows in np.array_split(np.arange(len(points)), -(-len(points) // WHOLE)):
-        distance[rows] = tree.query(points[rows], k=NEIGHBOURS + 1, workers=threads())[0][:, 1:].mean(1)
-    distance /= pixel
-    return distance <= OUTLIER_RATIO * np.median(distance)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.cloud_file import NEIGHBOURS
+from scenefuse.cloud.clouds import NEIGHBOURS
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, quantity, threads, value, write_json
 from scenefuse.core.transforms import Array

@@ -12,14 +12,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.cloud_file import NEIGHBOURS
-from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample, write_cloud
+from scenefuse.cloud.clouds import NEIGHBOURS, Cloud, concatenate, near_others, spacing, voxel_downsample, write_cloud
 from scenefuse.cloud.import_cloud import MIN_POINTS
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, write_json
 from scenefuse.geometry.consistency import compare, extent, surface_points
 from scenefuse.geometry.surface import normals_at
-from scenefuse.mvs.dense_cloud import near_others
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.sparse_depths import MASK_REACH_PX, sparse_depths
 from scenefuse.mvs.stereo_points import with_stereo

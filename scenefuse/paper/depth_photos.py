@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import siegelslopes
 from torch import Tensor
 
-from scenefuse.cloud.cloud_file import NEIGHBOURS
+from scenefuse.cloud.clouds import NEIGHBOURS
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.surface import ends_of
 from scenefuse.nerf.depth_prior import points_on_object

@@ -10,11 +10,11 @@ import pycolmap
 import pytest
 import torch
 
+from scenefuse.cloud import clouds
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import look_at
 from scenefuse.geometry.matcher import Matcher
-from scenefuse.mvs import dense_cloud
 from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
 from scenefuse.mvs.depth_maps import estimate_depth_maps
 from scenefuse.mvs.plane_sweep import DepthMapSettings
@@ -263,9 +263,9 @@ def test_oblique_photos_take_no_points_from_those_from_above(tmp_path):
 def test_a_point_far_from_all_others_is_found_in_clouds_of_any_size(monkeypatch):
     points = np.random.default_rng(0).uniform(0, [100, 20, 1], (5000, 3))
     points[7] = [50, 90, 0]
-    whole = dense_cloud.near_others(points)
-    monkeypatch.setattr(dense_cloud, "WHOLE", 400)
-    assert not whole[7] and whole.mean() > 0.99 and np.array_equal(dense_cloud.near_others(points), whole)
+    whole = clouds.near_others(points)
+    monkeypatch.setattr(clouds, "AT_ONCE", 400)
+    assert not whole[7] and whole.mean() > 0.99 and np.array_equal(clouds.near_others(points), whole)
 
 
 @pytest.fixture
