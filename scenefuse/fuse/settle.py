@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud
+from scenefuse.cloud.import_cloud import MIN_POINTS
 from scenefuse.core.transforms import Sim3, Uncertainty
-from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.fuse.measure import RESOLUTION
 from scenefuse.geometry.icp import ScaleRange, change_between, refine_planes
 from scenefuse.geometry.surface import SAMPLED_POINTS, SCORE_FRACTION, Surface, with_queries

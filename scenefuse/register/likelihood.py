@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
+from scenefuse.cloud.import_cloud import MIN_POINTS
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import MAX_DEVIATIONS, Array, Sim3, Uncertainty
-from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, change_between, moved_about, similarity_rows
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface, nearest_rows
 from scenefuse.register.score import MIN_COLOR_NOISE

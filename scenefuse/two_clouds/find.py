@@ -10,12 +10,13 @@ import numpy as np
 
 from scenefuse.cloud.cloud_file import EVERYWHERE, normals_fault
 from scenefuse.cloud.clouds import Cloud, read_cloud, sampled_rows
+from scenefuse.cloud.import_cloud import MIN_POINTS
 from scenefuse.cloud.readers.text import TEXTS
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import MAX_DEVIATIONS, UP, Array, Sim3, uncertainty_quantities
 from scenefuse.crop.crop_cloud import CropSettings
-from scenefuse.crop.crop_scene import MIN_POINTS, around_marks, crop_marked
+from scenefuse.crop.crop_scene import around_marks, crop_marked
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import SCORE_FRACTION, with_queries
 from scenefuse.marks.clicks import ScenePoints, read_points

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from scenefuse.cloud.clouds import Cloud, voxel_downsample
+from scenefuse.cloud.import_cloud import MIN_POINTS
 from scenefuse.core.transforms import UP, Array, rotation_between
 from scenefuse.crop.crop_cloud import CropSettings, crop_cloud
-from scenefuse.crop.crop_scene import MIN_POINTS
 from scenefuse.geometry.surface import SCORE_FRACTION, Surface, prepare
 
 Rows = NDArray[np.int64]

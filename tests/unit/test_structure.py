@@ -11,6 +11,7 @@ from support.packages import PACKAGES
 ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = ROOT / "scenefuse"
 MAY_IMPORT = {name: set(PACKAGES[: PACKAGES.index(name) + 1]) for name in PACKAGES}
+MAY_IMPORT |= {name: MAY_IMPORT[name] - {"crop"} for name in ("register", "fuse")}
 MAY_IMPORT |= {"new_project": {"core", "cloud", "photos"}, "complete": {"core", "marks", "report", "new_project"}}
 MAY_IMPORT |= {"command_line": {*PACKAGES, "new_project", "complete", "export"}}
 MAY_IMPORT |= {"export": {"core", "report"}}
