@@ -161,7 +161,7 @@ def _located(
     if isinstance(marked, ScenePoints) and frame is not None:
         there = to_wgs84(pyproj.CRS.from_user_input(frame.crs), marked.positions, str(inputs.fiducials))
         return marked.points, frame.apply(there), None
-    return *locate(inputs.fiducials, inputs.sparse, settings.max_residual_px)[:2], None
+    return *locate(marked, inputs.sparse, settings.max_residual_px)[:2], None
 
 
 def _frame_of_cloud(georeference_json: Path | None) -> LocalFrame | None:

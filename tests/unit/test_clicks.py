@@ -116,9 +116,9 @@ def test_clicks_as_shares_of_width_and_height_are_named(tmp_path):
 
 
 def test_labels_are_not_fiducials(tmp_path):
-    assert read(tmp_path, [("inside", "f00.png", 5, 5)]).kind == "labels"
+    labels = read(tmp_path, [("inside", "f00.png", 5, 5)])
     with pytest.raises(StageError, match="holds labels; mark points here"):
-        locate(tmp_path / "prompts.tsv", tmp_path, 5)
+        locate(labels, tmp_path, 5)
 
 
 def bent_model(folder, view, k):

@@ -143,7 +143,7 @@ def test_both_kinds_of_file(tmp_path):
     path.write_text("point\tx\ty\tz\na\t1\t2\t3\nb\t4\t5\t6e1\n")
     points = read_points(path)
     assert isinstance(points, ScenePoints) and points.points == ["a", "b"]
-    names, positions, residuals = locate(path, tmp_path / "no model needed", 5.0)
+    names, positions, residuals = locate(points, tmp_path / "no model needed", 5.0)
     np.testing.assert_array_equal(positions, [[1, 2, 3], [4, 5, 60]])
     assert names == ["a", "b"] and not residuals.any()
 
