@@ -16,9 +16,10 @@ from scenefuse.core.transforms import UP, Array, Sim3
 from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole, without_strays
 from scenefuse.crop.marked import MAX_GROWTH, SceneClicks, crop_grown, locate_clicks, read_masked_views, vote
 from scenefuse.geometry.surface import SAMPLED_POINTS
-from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
-from scenefuse.marks.triangulation import locate
+from scenefuse.marks.clicks import ScenePoints, read_points
+from scenefuse.marks.triangulation import triangulate
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
+from scenefuse.photos.workspace import read_model
 
 MIN_FIDUCIALS = 4
 # Points of a scene in which an object is searched without any mark.
@@ -154,14 +155,15 @@ def _located(
     if inputs.sparse is None:
         return *points_in(inputs.fiducials, inputs.georeference_json), None
     marked = read_points(inputs.fiducials)
-    if isinstance(marked, Clicks) and marked.kind == "labels":
+    if isinstance(marked, ScenePoints):
+        frame, given = _frame_of_cloud(inputs.georeference_json), marked.positions
+        if frame is not None:
+            given = frame.apply(to_wgs84(pyproj.CRS.from_user_input(frame.crs), given, str(inputs.fiducials)))
+        return marked.points, given, None
+    if marked.kind == "labels":
         found = locate_clicks(marked, inputs.sparse, scene)
         return found.names, found.inside, found
-    frame = _frame_of_cloud(inputs.georeference_json)
-    if isinstance(marked, ScenePoints) and frame is not None:
-        there = to_wgs84(pyproj.CRS.from_user_input(frame.crs), marked.positions, str(inputs.fiducials))
-        return marked.points, frame.apply(there), None
-    return *locate(marked, inputs.sparse, settings.max_residual_px)[:2], None
+    return *triangulate(marked, read_model(inputs.sparse), settings.max_residual_px)[:2], None
 
 
 def _frame_of_cloud(georeference_json: Path | None) -> LocalFrame | None:

@@ -12,8 +12,8 @@ import numpy as np
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
-from scenefuse.marks.clicks import Click, Clicks, ScenePoints, check_inside, in_photos, read_length_clicks
-from scenefuse.photos.workspace import images_by_name, ray_through, read_model
+from scenefuse.marks.clicks import Click, Clicks, check_inside, in_photos, read_length_clicks
+from scenefuse.photos.workspace import images_by_name, ray_through
 
 if TYPE_CHECKING:
     import pycolmap
@@ -23,19 +23,6 @@ Sizes = Mapping[str, tuple[int, int]]
 MAX_CLICK_MISS = 0.005
 # Lengths that differ by more from one scale say that one of them is wrong; as a share of the length.
 MAX_LENGTH_ERROR = 0.05
-
-
-def locate(marked: Clicks | ScenePoints, model: Path, max_residual_px: float) -> tuple[list[str], Array, Array]:
-    """Marked points of either kind in the frame of a COLMAP model (scene points are taken to be in it already).
-
-    Returns:
-        Names, (P, 3) positions, (P,) residuals in pixels, which are 0 for points given by coordinates.
-    """
-    if isinstance(marked, ScenePoints):
-        return marked.points, marked.positions, np.zeros(len(marked.points))
-    if marked.kind == "labels":
-        raise StageError(f"{marked.path} holds labels; mark points here ('point photo x_px y_px')")
-    return triangulate(marked, read_model(model), max_residual_px)
 
 
 def triangulate(

@@ -11,7 +11,6 @@ from support.planted_ball import FOCAL, HEIGHT, MIDDLE, WIDTH, photos_of_a_ball
 from scenefuse.core.stage import StageError
 from scenefuse.marks.clicks import read_points
 from scenefuse.marks.photo_clicks import clicks_per_photo
-from scenefuse.marks.triangulation import locate
 from scenefuse.photos.workspace import write_model
 
 HEADER = "label\tphoto\tx_px\ty_px\n"
@@ -113,12 +112,6 @@ def test_clicks_as_shares_of_width_and_height_are_named(tmp_path):
     with pytest.raises(StageError, match="all clicks are within the first pixel; multiply shares"):
         read(tmp_path, [("inside", "f00.png", 0.4, 0.6), ("outside", "f00.png", 0.1, 0.9)])
     assert len(read(tmp_path, [("inside", "f00.png", 0.4, 0.6), ("outside", "f00.png", 90, 1)]).rows) == 2
-
-
-def test_labels_are_not_fiducials(tmp_path):
-    labels = read(tmp_path, [("inside", "f00.png", 5, 5)])
-    with pytest.raises(StageError, match="holds labels; mark points here"):
-        locate(labels, tmp_path, 5)
 
 
 def bent_model(folder, view, k):

@@ -9,7 +9,7 @@ from PIL import Image
 
 from scenefuse.core.stage import StageError
 from scenefuse.marks.clicks import Click, Clicks, ScenePoints, check_marks, read_length_clicks, read_points
-from scenefuse.marks.triangulation import locate, triangulate, triangulate_consistent
+from scenefuse.marks.triangulation import triangulate, triangulate_consistent
 
 LABELS = "label\tphoto\tx_px\ty_px\n"
 POINTS = {"roof": [0.3, -0.2, 0.1], "door": [-0.4, 0.1, 0.3]}
@@ -143,9 +143,7 @@ def test_both_kinds_of_file(tmp_path):
     path.write_text("point\tx\ty\tz\na\t1\t2\t3\nb\t4\t5\t6e1\n")
     points = read_points(path)
     assert isinstance(points, ScenePoints) and points.points == ["a", "b"]
-    names, positions, residuals = locate(points, tmp_path / "no model needed", 5.0)
-    np.testing.assert_array_equal(positions, [[1, 2, 3], [4, 5, 60]])
-    assert names == ["a", "b"] and not residuals.any()
+    np.testing.assert_array_equal(points.positions, [[1, 2, 3], [4, 5, 60]])
 
 
 @pytest.mark.parametrize(
