@@ -22,7 +22,7 @@ LAS_DESCRIPTIONS = {
     "match": "their mean correlation, -1 to 1",
     "deviation": "sd on the line of sight",
     "world_deviation": "the same with the pose's",
-    "evidence": "1 measured; 0, 2, 3 not (README)",
+    "evidence": "1 measured, 4 plain; others not",
 }
 # Fields that are lengths, in the unit of the points.
 LENGTHS = {"deviation", "world_deviation"}

@@ -187,6 +187,16 @@ def surface_facts(folder: Path, row: Row) -> dict[str, str]:
     return facts | {"Drawings": f"{place}/drawings/drawings.pdf, {scale}{above}"}
 
 
+def scene_exports(folder: Path) -> dict[str, str]:
+    """The same of what `scenefuse export` made in a scene's results."""
+    found, place = dict[str, str](), f"results/scenes/{folder.name}"
+    if (folder / "cameras/transforms.json").is_file():
+        found["Cameras"] = f"{place}/cameras (COLMAP, transforms.json, Metashape's cameras.xml), {WORDS['cameras']}"
+    if is_current(folder / "tiles/points/tileset.json", folder / "completed.ply"):
+        found["Tiles"] = f"{place}/tiles/points/tileset.json, {place}/tiles/surfaces/tileset.json (3D Tiles 1.1)"
+    return found
+
+
 def accuracies(row: Row) -> list[str]:
     """How exact a scene or an object is, in sentences; the first is the one to quote."""
     has = _known(row)

@@ -29,7 +29,7 @@ from scenefuse.sfm.gravity import estimate_up
 
 SCENE = "#cdd0d4"
 LACKS = {
-    Lack.NEVER_SEEN: ("red", "#d6261f"), Lack.UNTEXTURED: ("blue", "#3465c4"), Lack.CONTRADICTED: ("yellow", "#e0a800")
+    Lack.NEVER_SEEN: ("red", "#d6261f"), Lack.UNTEXTURED: ("yellow", "#e0a800"), Lack.CONTRADICTED: ("blue", "#3465c4")
 }  # fmt: skip
 # Azimuths of the four sides that a row of pictures shows.
 SIDES_DEG = (30.0, 120.0, 210.0, 300.0)

@@ -15,9 +15,12 @@ from scenefuse.core.version import VERSION
 from scenefuse.photos.sheets import round_below
 from scenefuse.report.facts import (
     ADDED,
+    Row,
+    accuracies,
     made_by,
     object_facts,
     rows_of,
+    scene_exports,
     scene_facts,
     scene_title,
     surface_facts,
@@ -44,12 +47,14 @@ def write_pdf(
         report: output PDF.
     """
     rows = rows_of(summary, "object", objects)
-    facts = [object_facts(row) | surface_facts(folder, row) for folder, row in zip(objects, rows)]
+    facts = [
+        _with_all(object_facts(row), "Accuracy", row) | surface_facts(folder, row) for folder, row in zip(objects, rows)
+    ]
     page = _Page(title or title_of(objects), made_by(summary))
     page.start(page.project, f"{page.made} Files named here lie in the project's folder or the archive you were sent.")
-    for row in rows_of(summary, "scene", scenes):
+    for folder, row in zip(scenes, rows_of(summary, "scene", scenes)):
         page.text_line(scene_title(row["scene"]), 12)
-        page.facts(scene_facts(row))
+        page.facts(_with_all(scene_facts(row), "Position", row) | scene_exports(folder))
     page.text_line("Objects", 12)
     # What is missing is told apart on the object's own page.
     surfaces = [each.get("Surface", "").split(":")[0] or shorten(each["Result"], 150) for each in facts]
@@ -77,6 +82,11 @@ def write_pdf(
         page.pictures([missing], ["what is missing, and from where photos would show it"])
     with atomic_file(report) as temporary:
         page.output(str(temporary))
+
+
+def _with_all(facts: dict[str, str], label: str, row: Row) -> dict[str, str]:
+    """Facts, of which one quotes how exact something is, with all that is known of that."""
+    return facts | {name: "; ".join([facts[name], *accuracies(row)[1:]]) for name in (label,) if name in facts}
 
 
 class _Page(FPDF):
@@ -178,12 +188,14 @@ class _Page(FPDF):
             with self.local_context(fill_color=217):  # as on the drawings: a wall may be white
                 self.rect(x, y, wide, high, "F")
             self.image(Image.fromarray(pixels), x, y, wide)
-            self.text(x, y + height * per_unit + 3, f"from the {side}")
+            looking = (-90 * k - value(known, "wall_turn")) % 360
+            self.text(x, y + height * per_unit + 3, f"from the {side}, looking towards {looking:.0f}°")
         bar = round_below(width / 2)
         self.set_y(top + 2 * (height * per_unit + 2 * GAP_MM) + 2)
-        self.set_line_width(1)
-        self.line(self.l_margin, self.get_y(), self.l_margin + bar * per_unit, self.get_y())
-        self.ln(1)
+        with self.local_context(fill_color=0):  # a line would reach half its width beyond its ends
+            self.rect(self.l_margin, self.get_y(), bar * per_unit, 1, "F")
+        self.ln(2)
         ratio = "" if unit == "scene units" else f"1:{scale:g} on A4; "
         north = "" if value(known, "has_north") else "; y taken for north"
-        self.cell(0, 5, f"{ratio}bar: {length(bar, unit)}; grey: not measured{north}", new_x="LMARGIN", new_y="NEXT")
+        colors = "purple: interpolated; grey: not measured"
+        self.cell(0, 5, f"{ratio}bar: {length(bar, unit)}; {colors}{north}", new_x="LMARGIN", new_y="NEXT")

@@ -17,6 +17,7 @@ from scenefuse.report.facts import (
     object_facts,
     rows_of,
     scale_sd,
+    scene_exports,
     scene_facts,
     scene_title,
     surface_facts,
@@ -77,8 +78,9 @@ def write_report(
         f"<header><h1>{escape(title)}</h1><p>{escape(made_by(summary))} {texts['intro']}</p>",
         f"<nav>{links}</nav></header>",
         *(
-            f'<section class="scene"><h2>{escape(scene_title(row["scene"]))}</h2>{_facts(scene_facts(row))}</section>'
-            for _, row in flown
+            f'<section class="scene"><h2>{escape(scene_title(row["scene"]))}</h2>'
+            f"{_facts(scene_facts(row) | scene_exports(folder))}</section>"
+            for folder, row in flown
         ),
         *(_object_card(folder, row, views.get(folder / "figures"), texts) for folder, row in shown),
         *(_scene_card(f, row, views.get(f), texts) for f, row in flown if (f / "scene.png").is_file()),

@@ -49,10 +49,10 @@ class Drawing:
     """A parallel projection of a surface's outside; the bands are (H, W), the first row at the top.
 
     Attributes:
-        colors: (H, W, 4) uint8 RGBA.
+        colors: (H, W, 4) uint8 RGBA, one tint where a gap is bridged.
         heights: float32, distance towards the viewer along the third axis; NaN where nothing is.
         classes: uint8 values of FaceClass, NOTHING where nothing is.
-        deviations: float32, NaN where unknown.
+        deviations: float32, NaN where unknown, and where a gap is bridged.
         left, top: of the picture's upper left corner along the drawing's axes.
         pixel: side of a pixel; all lengths are in the surface's unit.
     """
@@ -112,6 +112,8 @@ def draw(surface: Surface, painted: Painted | None, axes: Array, pixel: float) -
             for k in range(3):
                 band = painted.picture[..., k]
                 colors[first + of, k] = map_coordinates(band, at[:, ::-1].T, order=1, mode="nearest")
+    bridged = classes == FaceClass.BRIDGED
+    colors[bridged, :3], deviations[bridged] = BRIDGED_TINT, np.nan
     shape = (height, width)
     flat = (heights.reshape(shape), classes.reshape(shape), deviations.reshape(shape))
     return Drawing(colors.reshape(*shape, 4), *flat, float(left), float(top), pixel)
@@ -166,8 +168,8 @@ def draw_surface(
 ) -> None:
     """Draw an object from above and from four sides, and a facade of it.
 
-    Of each drawing NAME: NAME.png, a sheet with frame and scale bar, bridged parts tinted; NAME.tif, the picture;
-    NAME_height.tif, NAME_class.tif, NAME_deviation.tif. `above` is a GeoTIFF in the scene's CRS where it has one.
+    Of each drawing NAME: NAME.png, a sheet with frame and scale bar; NAME.tif, the picture; NAME_height.tif,
+    NAME_class.tif, NAME_deviation.tif. `above` is a GeoTIFF in the scene's CRS where it has one.
     Elevations are turned to the object's walls; heights of `facade` are distances from its plane. drawings.pdf has all
     sheets, A3, to the scale that they say.
 
@@ -177,7 +179,8 @@ def draw_surface(
         glb: the same with a picture from photos, or without.
         georeference_json: JSON of the scene.
         facade: x y z of three points of a wall or a roof, in the scene's frame; none for no such drawing.
-        folder: output, with drawings.json: pixel, scale, direction of each.
+        folder: output, with drawings.json: pixel and scale of each, and NAME_from_scene, (4, 4): the files' x, y and
+            distance towards the viewer of a place in the scene; of `above` where it is in no CRS.
     """
     whole, painted = read_surface(surface), read_painted(glb)
     unit = length_unit(georeference_json)
@@ -226,6 +229,8 @@ def draw_surface(
             figure.savefig(output / f"{side}.png", dpi=200)
             pdf.savefig(figure)
             report[f"{side}_pixel"], report[f"{side}_scale"] = quantity(drawing.pixel, counted), quantity(scale, "1")
+            if crs is None:
+                report[f"{side}_from_scene"] = quantity(np.vstack([np.column_stack([axes, shift]), [0, 0, 0, 1]]), unit)
         if not len(whole.faces):
             pdf.savefig(Figure(figsize=(1, 1)))
         report |= {"wall_turn": quantity(float(np.degrees(turn)), "deg"), "crs": quantity(frame and frame.crs, "")}
@@ -292,7 +297,7 @@ def _scale(drawing: Drawing, metres: float, unit: str) -> float:
 def _sheet(
     drawing: Drawing, title: str, unit: str, page_per_unit: float, corner: tuple[float, float], crs: str | None
 ) -> Figure:
-    """A page with a frame, a scale bar and tinted bridges.
+    """A page with a frame and a scale bar.
 
     Args:
         drawing: what is on it.
@@ -307,11 +312,9 @@ def _sheet(
     figure = Figure(figsize=(PAGE[0] / inch, PAGE[1] / inch), facecolor="white")
     size = width * page_per_unit / PAGE[0], height * page_per_unit / PAGE[1]
     axes = figure.add_axes(((1 - size[0]) / 2, (1 - size[1]) / 2, *size))
-    picture = drawing.colors.copy()
-    picture[drawing.classes == FaceClass.BRIDGED, :3] = BRIDGED_TINT
     extent = (corner[0], corner[0] + width, corner[1] - height, corner[1])
     axes.set_facecolor("0.85")  # a wall may be white
-    axes.imshow(picture, extent=extent, interpolation="antialiased")
+    axes.imshow(drawing.colors, extent=extent, interpolation="antialiased")
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.tick_params(labelsize=7)
     axes.set_title(f"{title} ({unit})", fontsize=10)

@@ -32,6 +32,8 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 BRIDGED_TINT = (203, 89, 188)
 # What has no colour.
 NO_COLOR = (160, 160, 160)
+# What `asset.extras` says of feature ids of faces.
+CLASSES = {"classes": {kind.name.lower(): int(kind) for kind in FaceClass}}
 
 
 class _Code(IntEnum):
@@ -110,18 +112,21 @@ def write_glb(
         content["images"] = [{"bufferView": buffer.add(encoded.getvalue()), "mimeType": "image/jpeg"}]
         content["textures"] = [{"source": 0}]
         colored["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
-    _write(path, buffer, primitives, extras, content)
+    _write(path, buffer, primitives, extras | CLASSES, content)
 
 
 def write_points(path: Path, cloud: Cloud, extras: dict[str, Any]) -> None:
-    """Write points, z up and in metres, with their colours and, where they have it, their `source` as feature id."""
+    """Write points, z up and in metres, with their colours and, where they have it, `source` and `evidence` as feature
+    ids."""
     buffer = _Buffer()
     attributes = _attributes(buffer, cloud.points, cloud.colors)
     primitive: dict[str, Any] = {"mode": 0, "attributes": attributes, "material": 0}
-    if "source" in cloud.fields:
-        source = cloud.fields["source"].astype(np.float32)
-        attributes["_FEATURE_ID_0"] = buffer.accessor(source, "SCALAR", _Code.FLOAT)
-        ids = [{"featureCount": int(source.max()) + 1, "attribute": 0, "label": "source"}]
+    ids = list[dict[str, Any]]()
+    for name in (name for name in ("source", "evidence") if name in cloud.fields):
+        values = cloud.fields[name].astype(np.float32)
+        attributes[f"_FEATURE_ID_{len(ids)}"] = buffer.accessor(values, "SCALAR", _Code.FLOAT)
+        ids.append({"featureCount": int(values.max()) + 1, "attribute": len(ids), "label": name})
+    if ids:
         primitive["extensions"] = {"EXT_mesh_features": {"featureIds": ids}}
     _write(path, buffer, [primitive], extras, {"materials": [{"extensions": {"KHR_materials_unlit": {}}}]})
 
@@ -268,7 +273,6 @@ def place_of_scene(georeference_json: Path | None) -> dict[str, Any]:
     content = {
         "axes": f"y up; x, y, z here are x, z, -y in the scene{compass}",
         "scene_unit": length_unit(georeference_json),
-        "classes": {kind.name.lower(): int(kind) for kind in FaceClass},
     }
     names = ("crs", "origin_in_crs", "crs_from_scene")
     return content | {name: value(known, name) for name in names if name in known}

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, read_cloud
-from scenefuse.core.stage import StageError, atomic_directory, write_json
+from scenefuse.core.stage import StageError, atomic_directory, read_json, value, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.core.version import VERSION
+from scenefuse.fuse.measure import Evidence
 from scenefuse.photos.geodesy import length_unit
-from scenefuse.surface.gltf import earth_from_scene, metres_per_unit, place_of_scene, write_glb, write_points
+from scenefuse.surface.gltf import CLASSES, earth_from_scene, metres_per_unit, place_of_scene, write_glb, write_points
 from scenefuse.surface.make_surface import read_surface
 from scenefuse.surface.mesh import Surface
 from scenefuse.surface.texture import TEXTURED_FACES
@@ -27,14 +28,17 @@ ALLOWED_PX = 16
 Tile = dict[str, Any]
 
 
-def make_tiles(*, cloud: Path, objects: list[Path], georeference_json: Path | None = None, folder: Path) -> None:
-    """Write points/tileset.json and surfaces/tileset.json.
+def make_tiles(
+    *, cloud: Path, report: Path, objects: list[Path], georeference_json: Path | None = None, folder: Path
+) -> None:
+    """Write points/tileset.json and surfaces/tileset.json; `asset.extras` says what their feature ids are.
 
     Points lie in an octree, each in one tile. A surface has two tiles, a coarse one and the whole.
     Where the scene has a place in the world the tiles have it too; heights are taken as those above the ellipsoid.
 
     Args:
         cloud: the completed scene.
+        report: its JSON, for what each `source` is.
         objects: result folders of its objects, with surface.ply and surface.glb.
         georeference_json: JSON of the scene.
         folder: output.
@@ -47,6 +51,7 @@ def make_tiles(*, cloud: Path, objects: list[Path], georeference_json: Path | No
         raise StageError(f"{cloud} holds no points; there is nothing to make tiles of")
     place = earth_from_scene(georeference_json, points.points.mean(0))
     extras = place_of_scene(georeference_json)
+    ids = {"sources": value(read_json(report), "sources"), "evidence": {k.name.lower(): int(k) for k in Evidence}}
     if place is not None:
         place[:3, :3] /= metres
     points = replace(points, points=metres * points.points)
@@ -54,7 +59,7 @@ def make_tiles(*, cloud: Path, objects: list[Path], georeference_json: Path | No
         for name in ("points", "surfaces"):
             (output / name).mkdir()
         order = np.random.default_rng(0).permutation(len(points))
-        _write(output / "points", [_points_tile(points, order, "r", output / "points")], place, extras)
+        _write(output / "points", [_points_tile(points, order, "r", output / "points")], place, extras | ids)
         tiles = []
         for path in objects:
             surface = read_surface(path / "surface.ply")
@@ -62,7 +67,7 @@ def make_tiles(*, cloud: Path, objects: list[Path], georeference_json: Path | No
                 whole = (path / "surface.glb").read_bytes()
                 (output / "surfaces" / f"{path.name}.glb").write_bytes(whole)
                 tiles.append(_surface_tile(path.name, surface, metres, extras, output / "surfaces"))
-        _write(output / "surfaces", tiles, place, extras)
+        _write(output / "surfaces", tiles, place, extras | CLASSES)
 
 
 def clustered(surface: Surface, size: float) -> Surface:
@@ -95,11 +100,12 @@ def _points_tile(points: Cloud, chosen: NDArray[np.int64], name: str, folder: Pa
 
 def _surface_tile(name: str, surface: Surface, metres: float, extras: dict[str, Any], folder: Path) -> Tile:
     """The tile of a surface in a coarse one, which is shown from afar: a quarter of the faces of a painted surface."""
-    points = metres * surface.vertices.points
-    low, high = points.min(0), points.max(0)
-    whole = _tile(low, high, f"{name}.glb", 0.0)
-    corners, coarse = surface.vertices.points[surface.faces], surface
+    points, coarse = metres * surface.vertices.points, surface
+    corners = surface.vertices.points[surface.faces]
     size = float(np.median(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1)))
+    # What is painted has fewer faces, whose corners lie a little beside these.
+    low, high = points.min(0) - metres * size, points.max(0) + metres * size
+    whole = _tile(low, high, f"{name}.glb", 0.0)
     while len(coarse.faces) > TEXTURED_FACES / 4:
         size *= 2
         coarse = clustered(surface, size)

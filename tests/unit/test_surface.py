@@ -28,14 +28,14 @@ from scenefuse.fuse.measure import Evidence
 from scenefuse.geometry.photo_check import pack
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
 from scenefuse.photos.workspace import View, read_views, write_model
-from scenefuse.report.facts import surface_facts
+from scenefuse.report.facts import scene_exports, surface_facts
 from scenefuse.report.view_mesh import read_mesh
 from scenefuse.report.write_pdf import write_pdf
 from scenefuse.surface import drawings as drawn
 from scenefuse.surface import texture, tiles
 from scenefuse.surface.cameras import export_cameras
 from scenefuse.surface.drawings import NOTHING, SIDES, draw, draw_surface, facade_axes, wall_turn
-from scenefuse.surface.gltf import Painted, earth_from_scene, place_of_scene, write_glb
+from scenefuse.surface.gltf import BRIDGED_TINT, Painted, earth_from_scene, place_of_scene, write_glb
 from scenefuse.surface.make_surface import SurfaceInputs, make_surface, read_surface, surface_report, write_surface
 from scenefuse.surface.mesh import FaceClass, Surface, make_mesh
 from scenefuse.surface.texture import beyond_manifold, textured, unfolded
@@ -448,6 +448,17 @@ def test_a_drawing_of_many_pixels_is_drawn_strip_by_strip_like_one_of_few(closed
         np.testing.assert_array_equal(band, vars(strips)[name])
 
 
+def test_what_is_bridged_has_one_tint_and_no_deviation_in_every_file(closed):
+    half = replace(closed, classes=np.where(np.arange(len(closed.faces)) % 2, FaceClass.MEASURED, FaceClass.BRIDGED))
+    drawing = draw(half, None, np.eye(3), 0.02)
+    bridged = drawing.classes == FaceClass.BRIDGED
+    assert bridged.any() and (drawing.colors[bridged, :3] == BRIDGED_TINT).all()
+    assert np.isnan(drawing.deviations[bridged]).all()
+    measured = drawing.classes == FaceClass.MEASURED
+    assert np.isfinite(drawing.deviations[measured]).any()
+    assert not (drawing.colors[measured, :3] == BRIDGED_TINT).all(1).any()
+
+
 def test_texels_of_many_pixels_are_found_strip_by_strip_like_those_of_few(monkeypatch):
     square, faces = (
         np.array([[0.1, 0.1, 0], [0.9, 0.1, 0], [0.9, 0.8, 1], [0.1, 0.8, 1]]),
@@ -475,7 +486,13 @@ def test_a_facade_is_drawn_of_the_plane_through_three_points_from_outside(coarse
     # Its front stands half a radius before the plane, and half of it lies behind.
     assert np.nanmax(heights) == pytest.approx(0.5, abs=0.01) and np.nanmin(heights) < 0
     assert {"facade.png", "facade_class.tif", "facade_deviation.tif"} <= {p.name for p in placed.iterdir()}
-    assert value(read_json(placed / "drawings.json"), "facade_scale") > 0
+    report = read_json(placed / "drawings.json")
+    assert value(report, "facade_scale") > 0 and "above_from_scene" not in report
+    # A place of the scene, the ball's nearest to the viewer, is found in the files.
+    x, y, away, _ = np.array(value(report, "facade_from_scene")) @ [*TOWARD, 1]
+    assert away == pytest.approx(0.5)
+    with rasterio.open(placed / "facade_height.tif") as file:
+        assert next(file.sample([(x, y)]))[0] == pytest.approx(away, abs=0.01)
     with pytest.raises(StageError, match="lie in a line"):
         facade_axes(coarse, np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
 
@@ -603,15 +620,17 @@ def test_tiles_hold_every_point_once_and_lie_where_the_scene_lies(closed, tmp_pa
     rng = np.random.default_rng(0)
     points = rng.uniform([0, 0, 0], [20, 10, 3], (3000, 3))
     cloud = Cloud(
-        points, None, rng.integers(0, 255, points.shape).astype(np.uint8), {"source": np.ones(3000, np.uint8)}
-    )
+        points, None, rng.integers(0, 255, points.shape).astype(np.uint8),
+        {"evidence": rng.integers(0, 5, 3000).astype(np.uint8), "source": np.ones(3000, np.uint8)},
+    )  # fmt: skip
+    write_json(tmp_path / "completed.json", {"sources": quantity({"0": "scene", "1": "ball"}, "")})
     write_cloud(tmp_path / "completed.ply", cloud)
     (tmp_path / "ball").mkdir()
     write_surface(tmp_path / "ball/surface.ply", closed)
     write_glb(tmp_path / "ball/surface.glb", closed, {})
     write_json(tmp_path / "g.json", GEOREFERENCE)
     tiles.make_tiles(
-        cloud=tmp_path / "completed.ply", objects=[tmp_path / "ball"],
+        cloud=tmp_path / "completed.ply", report=tmp_path / "completed.json", objects=[tmp_path / "ball"],
         georeference_json=tmp_path / "g.json", folder=tmp_path / "tiles",
     )  # fmt: skip
     found = []
@@ -636,6 +655,18 @@ def test_tiles_hold_every_point_once_and_lie_where_the_scene_lies(closed, tmp_pa
         top = earth @ [20, 10, 3, 1]
         easting, northing, _ = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:25832").transform(*top[:3])
         assert (easting, northing) == pytest.approx((500120, 5200210), abs=0.01)
+    # What the numbers of features are stands in the file of the tiles.
+    extras = {
+        name: read_json(tmp_path / f"tiles/{name}/tileset.json")["asset"]["extras"] for name in ("points", "surfaces")
+    }
+    assert extras["points"]["sources"] == {"0": "scene", "1": "ball"} and extras["points"]["evidence"]["measured"] == 1
+    assert "classes" not in extras["points"] and extras["surfaces"]["classes"]["bridged"] == FaceClass.BRIDGED
+    data = (tmp_path / "tiles/points/r.glb").read_bytes()
+    (mesh,) = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])["meshes"]
+    (primitive,) = mesh["primitives"]
+    ids = primitive["extensions"]["EXT_mesh_features"]["featureIds"]
+    assert [one["label"] for one in ids] == ["source", "evidence"] and ids[0]["featureCount"] == 2
+    assert all(f"_FEATURE_ID_{one['attribute']}" in primitive["attributes"] for one in ids)
     every = np.concatenate([part for uri, part in found if uri.startswith("r")])
     assert np.allclose(every[np.lexsort(every.T)], points[np.lexsort(points.astype(np.float32).T)], atol=1e-5)
     counts = [len(part) for uri, part in found if uri.startswith("ball")]
@@ -648,7 +679,9 @@ def test_tiles_and_cameras_kilometres_from_the_origin_of_their_scene_lie_where_t
     write_cloud(tmp_path / "completed.ply", Cloud(far + np.eye(3)))
     write_json(tmp_path / "g.json", GEOREFERENCE | {"origin_in_crs": quantity([46e4, 521e4, 0.0], "m")})
     here = {"georeference_json": tmp_path / "g.json"}
-    tiles.make_tiles(cloud=tmp_path / "completed.ply", objects=[], folder=folder / "tiles", **here)
+    write_json(tmp_path / "c.json", {"sources": quantity({"0": "scene"}, "")})
+    given = {"cloud": tmp_path / "completed.ply", "report": tmp_path / "c.json"}
+    tiles.make_tiles(**given, objects=[], folder=folder / "tiles", **here)
     earth = np.array(read_json(folder / "tiles/points/tileset.json")["root"]["transform"]).reshape(4, 4).T
     found = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*(earth @ [*far, 1])[:3])
     there = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:25832", always_xy=True).transform(*found[:2])
@@ -824,8 +857,8 @@ def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_int
     shares = {kind: quantity(area / 1000, "of the area") for kind, area in areas.items()}
     write_json(tmp_path / "surface.json", surface_report(closed, "m") | faces | shares)
     assert surface_facts(tmp_path, {})["Mesh area"] == (
-        "1,000 m² with its surroundings: 92.0 % measured, 5.0 % beside points that photos do not confirm, 1.0 %"
-        " interpolated over narrow gaps (purple in the drawings), 2.0 % left open as gaps"
+        "1,000 m² with its surroundings: 92.0 % measured, 5.0 % beside points that photos do not confirm, or that were"
+        " not checked, 1.0 % interpolated over narrow gaps (purple in the drawings), 2.0 % left open as gaps"
     )
     # A run makes what was exported before again, also of an object that it refuses now.
     write_json(tmp_path / "fusion.json", {"status": quantity("unregistered", "")})
@@ -843,6 +876,17 @@ def test_the_report_says_of_a_surface_where_it_is_in_which_frame_and_what_is_int
     assert surface_facts(tmp_path, {"unit": "scene units"})["Drawings"].endswith("scale bars, to no scale in metres")
     named = surface_facts(tmp_path, {"crs": pyproj.CRS("EPSG:25832+7837").to_wkt("WKT1_GDAL")})["Drawings"]
     assert named.endswith("above.tif beside it, for QGIS, is in ETRS89 / UTM zone 32N + DHHN2016 height")
+
+
+def test_the_report_says_of_a_scene_where_its_exports_are(tmp_path: Path):
+    assert scene_exports(tmp_path) == {}
+    for name in ("cameras/transforms.json", "completed.ply", "tiles/points/tileset.json"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    found = scene_exports(tmp_path)
+    assert "without distortion" in found["Cameras"] and found["Tiles"].endswith("tileset.json (3D Tiles 1.1)")
+    os.utime(tmp_path / "tiles/points/tileset.json", (0, 0))  # of a scene that was completed again since
+    assert "Tiles" not in scene_exports(tmp_path)
 
 
 def test_paper_begins_with_an_overview_and_gives_an_object_two_pages_with_its_sides_to_scale(drawings, tmp_path: Path):
@@ -890,6 +934,11 @@ def test_four_sides_on_paper_are_to_the_round_scale_that_is_written_below(placed
         wide_m = file.width * value(known, "south_pixel")
     left, _, right, _ = next(iter(page.get_objects([3]))).get_bounds()
     assert (right - left) / 72 * 0.0254 * scale == pytest.approx(wide_m, rel=0.01)
+    # The bar is as long as it says, a millimetre high.
+    bounds = [one.get_bounds() for one in page.get_objects([2])]
+    (bar,) = {round(r - a, 1) for a, b, r, t in bounds if t - b == pytest.approx(72 / 25.4, abs=0.05)}
+    says = float(re.search(r"bar: ([\d.]+) m", page.get_textpage().get_text_bounded())[1])
+    assert bar / 72 * 0.0254 * scale == pytest.approx(says, rel=0.005)
     assert scale in {round(k * 10.0**power) for k in (1, 1.5, 2, 2.5, 3, 4, 5, 7.5) for power in range(4)}
 
 
@@ -901,7 +950,9 @@ def test_four_sides_of_a_small_object_fill_their_place_on_paper_and_no_more(tmp_
     drawings = tmp_path / "shed/drawings"
     drawings.mkdir(parents=True)
     pixels = {f"{side}_pixel": quantity(pixel, unit) for side in ("south", "east", "north", "west")}
-    write_json(drawings / "drawings.json", pixels | {"has_north": quantity(True, "")})
+    write_json(
+        drawings / "drawings.json", pixels | {"has_north": quantity(True, ""), "wall_turn": quantity(20.0, "deg")}
+    )
     for name in pixels:
         Image.new("RGB", (220, 100), "red").save(drawings / f"{name.removesuffix('_pixel')}.tif")
     (tmp_path / "objects.tsv").write_text("object\tstatus\nshed\tregistered\n")
@@ -910,7 +961,8 @@ def test_four_sides_of_a_small_object_fill_their_place_on_paper_and_no_more(tmp_
     assert "what is missing" not in page.get_textpage().get_text_bounded()  # of clouds nothing says it
     (left, *_, right, _), (beside, *_, end, _), *_ = (image.get_bounds() for image in page.get_objects([3]))
     assert right - left > 200 and right < beside and end < 595
-    assert said in page.get_textpage().get_text_bounded()
+    text = page.get_textpage().get_text_bounded()
+    assert said in text and "from the south, looking towards 340°" in text and "west, looking towards 70°" in text
     # A drawing that was deleted leaves the report without the page of the four sides, not without the report.
     (drawings / "east.tif").unlink()
     write_pdf(summary=tmp_path, objects=(tmp_path / "shed",), title="yard", report=tmp_path / "r.pdf")

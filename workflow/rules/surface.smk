@@ -105,6 +105,7 @@ rule make_tiles:
     """3D Tiles for web viewers: the completed scene's points, and the surfaces of its objects."""
     input:
         cloud="results/scenes/{scene}/completed.ply",
+        report="results/scenes/{scene}/completed.json",
         surfaces=finished_in("surface.ply"),
         glbs=finished_in("surface.glb"),
         georeference="results/scenes/{scene}/georeference.json",
@@ -126,5 +127,5 @@ rule make_tiles:
     message:
         "{wildcards.scene}: 3D Tiles"
     shell:
-        "exec python {params.script} --cloud {input.cloud} --objects {params.objects}"
+        "exec python {params.script} --cloud {input.cloud} --report {input.report} --objects {params.objects}"
         " --georeference-json {input.georeference} --folder {output} &> {log}"
