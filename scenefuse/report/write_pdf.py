@@ -61,7 +61,7 @@ def write_pdf(
     found = [[each.get("Size", "-"), surface] for each, surface in zip(facts, surfaces)]
     page.rows([[folder.name, verdict(row), *more] for folder, row, more in zip(objects, rows, found)], (3, 3, 7, 12))
     for folder in scenes:
-        page.pictures([folder / "scene.png"], [f"scene {folder.name}"])
+        page.pictures([folder / "scene.png"], [scene_title(folder.name)])
     for folder, row, each in zip(objects, rows, facts):
         page.start(folder.name, page.made)
         page.facts(each)
