@@ -86,7 +86,7 @@ def write_pdf(
 
 def _with_all(facts: dict[str, str], label: str, row: Row) -> dict[str, str]:
     """Facts, of which one quotes how exact something is, with all that is known of that."""
-    return facts | {name: "; ".join([facts[name], *accuracies(row)[1:]]) for name in (label,) if name in facts}
+    return facts | {label: "; ".join([facts[label], *accuracies(row)[1:]])} if label in facts else facts
 
 
 class _Page(FPDF):

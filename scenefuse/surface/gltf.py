@@ -122,7 +122,7 @@ def write_points(path: Path, cloud: Cloud, extras: dict[str, Any]) -> None:
     attributes = _attributes(buffer, cloud.points, cloud.colors)
     primitive: dict[str, Any] = {"mode": 0, "attributes": attributes, "material": 0}
     ids = list[dict[str, Any]]()
-    for name in (name for name in ("source", "evidence") if name in cloud.fields):
+    for name in filter(cloud.fields.__contains__, ("source", "evidence")):
         values = cloud.fields[name].astype(np.float32)
         attributes[f"_FEATURE_ID_{len(ids)}"] = buffer.accessor(values, "SCALAR", _Code.FLOAT)
         ids.append({"featureCount": int(values.max()) + 1, "attribute": len(ids), "label": name})
