@@ -13,7 +13,7 @@ from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, quantity, read_json, sha256, threads, value, write_json
 from scenefuse.photos.photo_files import FORMATS, JPEG, in_folders, open_picture
-from scenefuse.photos.pictures import JPEG_QUALITY, read_raw, stretched
+from scenefuse.photos.pictures import JPEG_QUALITY, read_raw, same_shape, stretched
 from scenefuse.photos.positions import exif_number, exif_text, stated_position
 
 # SIFT finds next to nothing in photos that use so much fewer bits than their files have: 12 of 16, or the dark 6 of 8.
@@ -45,6 +45,7 @@ class Photo:
         focal_mm: EXIF's focal length as it is, or None.
         position_note: why there is no position though EXIF or XMP give one, or what was assumed of it, or "".
         unused_bits: leading bits of its pixels, of 8 or 16, that are 0 in all but a few hot ones.
+        cropped: whether EXIF gives the size of a picture of another shape; its principal point may be anywhere then.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Photo:
     focal_mm: float | None = None
     position_note: str = ""
     unused_bits: int = 0
+    cropped: bool = False
 
     @property
     def has_gps(self) -> bool:
@@ -189,13 +191,17 @@ def inspect_photo(folder: Path, name: str) -> Photo:
         # It crops what the lens shows, and focal lengths in EXIF often do not count it; 0 is for none.
         zoom = f"{exif_number(taken.get(Base.DigitalZoomRatio)) or 1:.2f}"
         width, height = image.size
+        # Either way round, for programs that turn a photo may leave these as they were.
+        across, down = (int(exif_number(taken.get(tag)) or 0) for tag in (Base.ExifImageWidth, Base.ExifImageHeight))
+        cropped = across * down > 0 and not any(same_shape(image.size, s) for s in ((across, down), (down, across)))
         return Photo(
             name,
             width,
             height,
             sha256(folder / name),
             # A 35 mm frame is 36 mm wide; COLMAP takes its prior from the longer side in the same way.
-            focal_px=equivalent_mm / 36.0 * max(width, height) or None,
+            focal_px=None if cropped else equivalent_mm / 36.0 * max(width, height) or None,
+            cropped=cropped,
             camera=f"{exif_text(exif.get(Base.Make))} {exif_text(exif.get(Base.Model))}".strip()
             + (f" zoomed {zoom} times" if zoom != "1.00" else ""),
             orientation=int(orientation) if orientation in range(1, 9) else 1,
@@ -242,6 +248,8 @@ def photo_notes(photos: list[Photo], bits: int) -> list[str]:
     odd = [p for p in photos if p.position_note]
     if odd:
         notes.append(f"the GPS positions of {len(odd)} photos: {odd[0].position_note} (of {odd[0].name}, for one)")
+    if cropped := sum(p.cropped for p in photos):
+        notes.append(f"{cropped} photos were cropped, by the size in EXIF: each has a principal point of its own")
     return notes + stretch_notes(bits)
 
 

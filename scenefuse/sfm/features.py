@@ -51,7 +51,7 @@ class FeatureSettings:
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"] = setting("SIMPLE_RADIAL")
     """COLMAP's camera model; focal length and distortion are refined."""
     camera_mode: Literal["auto", "single", "per_folder", "per_photo"] = setting("auto")
-    """Which photos share one camera; auto: those with one size, EXIF camera, focal length and rotation."""
+    """Which photos share one camera; auto: uncropped ones of one size, EXIF camera, focal length, rotation."""
 
 
 def extract_features(
@@ -136,7 +136,7 @@ def camera_groups(photos: list[Photo], mode: str) -> list[list[str]]:
         StageError: mode "single" and photos of different sizes.
     """
     keys: dict[str, Callable[[Photo], Any]] = {
-        "auto": lambda p: (p.width, p.height, p.camera, _zoom(p)),
+        "auto": lambda p: p.name if p.cropped else (p.width, p.height, p.camera, _zoom(p)),
         "single": lambda p: (p.width, p.height),
         "per_folder": lambda p: (str(Path(p.name).parent), p.width, p.height),
         "per_photo": lambda p: p.name,

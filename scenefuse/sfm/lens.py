@@ -5,6 +5,7 @@ better with them; where they are not, they are held, and the photos say nothing 
 """
 
 import copy
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -76,7 +77,9 @@ class Choice(NamedTuple):
     next: Lens | None
 
 
-def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTORTED) -> Choice:
+def choose_lens(
+    model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTORTED, cropped: Collection[str] = ()
+) -> Choice:
     """Go from the poorest lens to richer ones while held-out observations are predicted better (method M9).
 
     Cross-validation (Stone 1974): one observation of every point that four photos or more see is left out of the
@@ -87,6 +90,7 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
     Args:
         model: bundle-adjusted; it is not changed.
         lenses: from poor to rich.
+        cropped: names of photos whose principal point may be anywhere.
     """
     kept, held = hold_out(model)
     best, beyond = lenses[0], None
@@ -100,7 +104,7 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
         gain = min(_gain(others, errors) for others in poorer)
         median = min(np.median(others) for others in poorer) if held else 0.0
         better = len(errors) > 0 and np.median(errors) <= (1 - MIN_MEDIAN_GAIN) * median
-        is_lens = _in_bounds(fitted)
+        is_lens = _in_bounds(fitted, cropped)
         if is_lens:
             poorer.append(errors)
             start = fitted
@@ -167,11 +171,12 @@ def _gain(poorer: Array, richer: Array) -> float:
     return float(smaller.mean() / max(smaller.std(ddof=1) / np.sqrt(len(smaller)), 1e-12))
 
 
-def _in_bounds(model: pycolmap.Reconstruction) -> bool:
+def _in_bounds(model: pycolmap.Reconstruction, cropped: Collection[str]) -> bool:
     """Whether the principal points of most photos are near enough to the middle to be a lens's; that of a cropped photo
     is not, and says nothing about the others'."""
     off = []
-    for camera in (model.cameras[model.images[photo].camera_id] for photo in model.reg_image_ids()):
+    photos = [model.images[photo] for photo in model.reg_image_ids()]
+    for camera in (model.cameras[photo.camera_id] for photo in photos if photo.name not in cropped):
         middle = np.array([camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2])
         off.append(np.abs(middle).max() / max(camera.width, camera.height))
-    return bool(np.median(off) <= MAX_OFF_CENTRE)
+    return not off or bool(np.median(off) <= MAX_OFF_CENTRE)

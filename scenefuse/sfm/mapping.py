@@ -78,6 +78,7 @@ class Job:
         database: with their verified matches.
         sparse: where the model will be; files in between lie beside it.
         share: smallest share of the photos that have to be registered.
+        cropped: names of the photos whose principal point may be anywhere.
     """
 
     names: list[str]
@@ -85,6 +86,7 @@ class Job:
     database: Path
     sparse: Path
     share: float
+    cropped: frozenset[str] = frozenset()
 
 
 def map_photos(
@@ -118,7 +120,9 @@ def map_photos(
         StageError: too small a share of the photos is registered; what `triangulated` and `read_lengths` say.
     """
     require_database(database)
-    job = Job([p.name for p in read_photos(photos)], folder, database, sparse, settings.min_registered_share)
+    listed = read_photos(photos)
+    cropped = frozenset(p.name for p in listed if p.cropped)
+    job = Job([p.name for p in listed], folder, database, sparse, settings.min_registered_share, cropped)
     if cameras is not None:
         model, content = _taken(job, cameras, read_json(photos), seed)
     else:
@@ -191,7 +195,7 @@ def _attempt(job: Job, calibrated: bool, seed: int) -> tuple[pycolmap.Reconstruc
     """The model that one seed gives, its lens, and what it is, as quantities."""
     ranked, least_matches = _mapped_first(job, calibrated, seed)
     _check_registered(ranked, job)
-    choice = choose_lens(ranked[0], (KNOWN,) if calibrated else DISTORTED)
+    choice = choose_lens(ranked[0], (KNOWN,) if calibrated else DISTORTED, job.cropped)
     lens, mappings = choice.lens, 1
     if lens not in (HELD, KNOWN):
         ranked, mappings = _with_lens(ranked, lens, job, _mapper_options(job, True, seed, least_matches))

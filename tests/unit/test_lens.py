@@ -88,6 +88,30 @@ def test_a_few_cropped_photos_do_not_hold_the_lens_of_the_others():
     assert lens == CENTRED and abs(camera.principal_point_x - 510) < 1 and abs(camera.principal_point_y - 388) < 1
 
 
+def test_principal_points_of_cropped_photos_are_refined_wherever_they_are():
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=16, num_cameras_per_rig=1, num_frames_per_rig=1, num_points3D=400, camera_width=800, camera_height=800
+    )
+    options.camera_model_id = pycolmap.CameraModelId.SIMPLE_RADIAL
+    options.camera_params = [700.0, 400.0, 400.0, 0.0]
+    model = pycolmap.synthesize_dataset(options)
+    pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.3), model)
+    cut = dict(zip(sorted(model.images), np.random.default_rng(0).uniform(-150, 150, 16)))
+    for photo, image in model.images.items():
+        for point in image.points2D:
+            point.xy = point.xy - [0.0, cut[photo]]
+    adjust(model, HELD.freedom)
+    lens, _ = choose_lens(model, cropped=[image.name for image in model.images.values()])
+    fitted = lens.fit(model)
+    for adjusted in (model, fitted):
+        adjusted.update_point_3d_errors()
+    assert lens == CENTRED
+    assert fitted.compute_mean_reprojection_error() < 0.4 < 0.6 < model.compute_mean_reprojection_error()
+    # One lens cannot be so: it is not refined where principal points run away.
+    assert choose_lens(model).lens == HELD
+
+
 def test_a_lens_in_the_middle_without_distortion_is_held():
     lens, beyond = choose_lens(photographed([700, 700, 500, 400, 0, 0, 0, 0]))
     assert (lens, beyond) == (HELD, CENTRED)

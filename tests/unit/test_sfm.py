@@ -17,7 +17,7 @@ from scenefuse.georef.georeference import camera_poses
 from scenefuse.mvs.undistort import UndistortSettings, undistort_photos, undistort_picture
 from scenefuse.photos.frames import FrameSettings, VideoSettings, extract_frames, list_photos
 from scenefuse.photos.geodesy import LocalFrame
-from scenefuse.photos.photos import Photo, inspect_photo, read_photos, write_photos
+from scenefuse.photos.photos import Photo, inspect_photo, photo_notes, read_photos, write_photos
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm import mapping
 from scenefuse.sfm.colmap import cancellable, doubtful_photos, explained_matches, require_database
@@ -186,6 +186,23 @@ def test_a_zoom_lens_that_does_not_tell_its_35_mm_equivalent_is_a_camera_for_eac
     # The equivalent says the same, and more; a lens that tells a little more at another distance stays one camera.
     prime = [replace(photo(f"{mm}", focal=900.0), focal_mm=mm) for mm in (35.0, 36.4)]
     assert len(camera_groups(prime, "auto")) == 1
+
+
+def test_photos_that_were_cropped_have_cameras_of_their_own_and_no_focal_length_by_exif(tmp_path):
+    (tmp_path / "p").mkdir()
+    taken_as = [(6000, 4000), (4000, 6000), (6000, 3376), (3376, 6000), (0, 0), None]
+    for number, sizes in enumerate(taken_as):
+        exif = Image.Exif()
+        exif[0x8769] = {0xA405: 24} | (dict(zip((0xA002, 0xA003), sizes)) if sizes else {})
+        Image.new("RGB", (60, 40), (number, 0, 0)).save(tmp_path / "p" / f"{number}.jpg", exif=exif)
+    photos = [inspect_photo(tmp_path / "p", f"{number}.jpg") for number in range(6)]
+    assert [p.name for p in photos if p.cropped] == ["2.jpg", "3.jpg"]
+    assert [p.focal_px for p in photos] == [40.0, 40.0, None, None, 40.0, 40.0]
+    assert camera_groups(photos, "auto") == [["0.jpg", "1.jpg", "4.jpg", "5.jpg"], ["2.jpg"], ["3.jpg"]]
+    assert len(camera_groups(photos, "single")) == 1
+    assert photo_notes(photos, 0) == [
+        "2 photos were cropped, by the size in EXIF: each has a principal point of its own"
+    ]
 
 
 def test_photos_of_another_digital_zoom_have_a_camera_of_their_own(tmp_path):
