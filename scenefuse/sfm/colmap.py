@@ -45,7 +45,7 @@ class Freedom:
 
     Attributes:
         lens: focal length and distortion; False where they are known.
-        principal_point: the principal point too.
+        principal_point: the principal point.
     """
 
     lens: bool = True
@@ -63,7 +63,7 @@ def adjustment_options(freedom: Freedom, tolerance: float = ADJUSTMENT_TOLERANCE
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = options.refine_extra_params = freedom.lens
-    options.refine_principal_point = freedom.lens and freedom.principal_point
+    options.refine_principal_point = freedom.principal_point
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = ROBUST_PX
     solver = options.ceres.solver_options

@@ -5,9 +5,10 @@ better with them; where they are not, they are held, and the photos say nothing 
 """
 
 import copy
+from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -43,12 +44,14 @@ class Lens:
         richest: cameras of poorer models become this; None leaves each as it is.
         freedom: what is refined.
         words: the choice in a few words.
+        shared: whether photos with cameras of their own get focal length and distortion in common.
     """
 
     name: str
     richest: str | None
     freedom: Freedom
     words: str
+    shared: bool = False
 
     def fit(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         """A copy of a model, adjusted with this lens."""
@@ -56,6 +59,8 @@ class Lens:
         for camera in fitted.cameras.values():
             if self.richest is not None:
                 enrich(camera, self.richest)
+        if self.shared:
+            share(fitted)
         adjust(fitted, self.freedom)
         return fitted
 
@@ -67,7 +72,17 @@ RADIAL = Lens("radial", "RADIAL", CENTRED.freedom, "principal point and two radi
 BROWN = Lens("brown", "OPENCV", CENTRED.freedom, "principal point and Brown distortion refined")
 RATIONAL = Lens("rational", "FULL_OPENCV", CENTRED.freedom, "principal point and rational distortion refined")
 DISTORTED = (HELD, CENTRED, RADIAL, BROWN, RATIONAL)
-LENSES = {lens.name: lens for lens in (KNOWN, *DISTORTED)}
+SHARED = tuple(
+    replace(
+        lens,
+        name=f"{lens.name}, shared",
+        freedom=Freedom(lens=False, principal_point=True),
+        words=f"{lens.words}, all but the principal point in common",
+        shared=True,
+    )
+    for lens in DISTORTED[1:]
+)
+LENSES = {lens.name: lens for lens in (KNOWN, *DISTORTED, *SHARED)}
 
 
 class Choice(NamedTuple):
@@ -85,7 +100,8 @@ def choose_lens(
     Cross-validation (Stone 1974): one observation of every point that four photos or more see is left out of the
     adjustment; the logarithmic (Cauchy) errors of a richer lens there have to be smaller than those of each poorer one,
     taken or not (but for one whose principal point ran away), pair by pair, by three standard errors of their mean, and
-    their median by half a per cent.
+    their median by half a per cent. Cropped photos share all but their principal points, unless their own lenses are
+    better by as many standard errors.
 
     Args:
         model: bundle-adjusted; it is not changed.
@@ -110,12 +126,17 @@ def choose_lens(
             start = fitted
         taken = better and gain >= MIN_GAIN and is_lens
         if taken:
-            best, beyond = lens, None
+            best, beyond, of_best = lens, None, (fitted, errors)
         elif beyond in (None, RADIAL):
             beyond = lens
         # A free principal point may help with distortion only, and one term of it with the others: all are tried.
         if not taken and lens.richest not in (None, RADIAL.richest):
             break
+    if cropped and best.freedom.principal_point:
+        shared = LENSES[f"{best.name}, shared"]
+        fitted, errors = of_best
+        if _gain(_errors(shared.fit(fitted), held), errors) < MIN_GAIN:
+            return Choice(shared, best)
     return Choice(best, beyond)
 
 
@@ -144,11 +165,63 @@ def enrich(camera: pycolmap.Camera, name: str) -> None:
         return
     focal = [camera.params[i] for i in camera.focal_length_idxs()]
     same = [camera.mean_focal_length()] if name == "RADIAL" else focal * (3 - len(focal))
-    centre = [camera.principal_point_x, camera.principal_point_y]
+    centre = _centre(camera)
     distortion = [camera.params[i] for i in camera.extra_params_idxs()]
     camera.model = getattr(pycolmap.CameraModelId, name)
     missing = len(camera.extra_params_idxs()) - len(distortion)
     camera.params = [*map(float, [*same, *centre, *distortion]), *[0.0] * missing]
+
+
+def share(model: pycolmap.Reconstruction) -> None:
+    """Adjust a model in place, with one lens for all cameras of a size and type that have one photo each: principal
+    points in turns with all else, until a turn changes next to nothing."""
+    photos = Counter(model.images[photo].camera_id for photo in model.reg_image_ids())
+    first: dict[Any, int] = {}
+    kind = {key: (camera.model, camera.width, camera.height) for key, camera in model.cameras.items()}
+    alike = {key: first.setdefault(kind[key], key) if photos[key] == 1 else key for key in sorted(photos)}
+    error = np.inf
+    while True:
+        together = _together(model, alike)
+        adjust(together, HELD.freedom)
+        for photo in together.reg_image_ids():
+            model.frames[model.images[photo].frame_id].rig_from_world = together.images[photo].cam_from_world()
+        for key, camera in model.cameras.items():
+            if key in alike:
+                centre = _centre(camera)
+                camera.params = together.cameras[alike[key]].params
+                camera.principal_point_x, camera.principal_point_y = centre
+        for key, point in together.points3D.items():
+            model.points3D[key].xyz = point.xyz
+        adjust(model, Freedom(lens=False, principal_point=True))
+        model.update_point_3d_errors()
+        before, error = error, model.compute_mean_reprojection_error()
+        if error > (1 - MIN_MEDIAN_GAIN) * before:
+            return
+
+
+def _together(model: pycolmap.Reconstruction, alike: dict[int, int]) -> pycolmap.Reconstruction:
+    """A model whose photos have the cameras that theirs are alike; what they see is moved with the principal point."""
+    together = pycolmap.Reconstruction()
+    for key in sorted(set(alike.values())):
+        medians = np.median([model.cameras[k].params for k, other in alike.items() if other == key], axis=0)
+        camera = pycolmap.Camera(model.cameras[key].todict())
+        camera.params = [*map(float, medians)]
+        together.add_camera_with_trivial_rig(camera)
+    for photo in sorted(model.reg_image_ids()):
+        image = model.images[photo]
+        key = alike[image.camera_id]
+        moved = _centre(together.cameras[key]) - _centre(model.cameras[image.camera_id])
+        seen = pycolmap.Point2DList([pycolmap.Point2D(point.xy + moved) for point in image.points2D])
+        copied = pycolmap.Image(name=image.name, points2D=seen, camera_id=key, image_id=photo)
+        together.add_image_with_trivial_frame(copied, image.cam_from_world())
+    for key, point in model.points3D.items():
+        together.add_point3D_with_id(key, point)
+    return together
+
+
+def _centre(camera: pycolmap.Camera) -> Array:
+    """(2,) principal point in pixels."""
+    return np.array([camera.principal_point_x, camera.principal_point_y])
 
 
 def _errors(model: pycolmap.Reconstruction, held: Held) -> Array:
@@ -177,6 +250,6 @@ def _in_bounds(model: pycolmap.Reconstruction, cropped: Collection[str]) -> bool
     off = []
     photos = [model.images[photo] for photo in model.reg_image_ids()]
     for camera in (model.cameras[photo.camera_id] for photo in photos if photo.name not in cropped):
-        middle = np.array([camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2])
-        off.append(np.abs(middle).max() / max(camera.width, camera.height))
+        size = np.array([camera.width, camera.height])
+        off.append(np.abs(_centre(camera) - size / 2).max() / size.max())
     return not off or bool(np.median(off) <= MAX_OFF_CENTRE)

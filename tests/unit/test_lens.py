@@ -14,7 +14,7 @@ from scenefuse.georef.spread import Spread, read_spread, spread_of, write_spread
 from scenefuse.register.likelihood import with_bending
 from scenefuse.sfm.colmap import adjust
 from scenefuse.sfm.features import read_calibration
-from scenefuse.sfm.lens import BROWN, CENTRED, HELD, RADIAL, choose_lens, enrich
+from scenefuse.sfm.lens import BROWN, CENTRED, HELD, LENSES, RADIAL, choose_lens, enrich
 
 MIDDLE = [700.0, 500.0, 400.0, 0.0]
 
@@ -88,7 +88,7 @@ def test_a_few_cropped_photos_do_not_hold_the_lens_of_the_others():
     assert lens == CENTRED and abs(camera.principal_point_x - 510) < 1 and abs(camera.principal_point_y - 388) < 1
 
 
-def test_principal_points_of_cropped_photos_are_refined_wherever_they_are():
+def test_principal_points_of_cropped_photos_are_found_wherever_they_are_and_the_rest_is_one_lens():
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=16, num_cameras_per_rig=1, num_frames_per_rig=1, num_points3D=400, camera_width=800, camera_height=800
@@ -106,8 +106,10 @@ def test_principal_points_of_cropped_photos_are_refined_wherever_they_are():
     fitted = lens.fit(model)
     for adjusted in (model, fitted):
         adjusted.update_point_3d_errors()
-    assert lens == CENTRED
+    assert lens == LENSES["centred, shared"]
     assert fitted.compute_mean_reprojection_error() < 0.4 < 0.6 < model.compute_mean_reprojection_error()
+    off = [fitted.images[photo].camera.principal_point_y - (400 - cut[photo]) for photo in cut]
+    assert np.abs(off).max() < 4 and {round(camera.params[0] / 7) for camera in fitted.cameras.values()} == {100}
     # One lens cannot be so: it is not refined where principal points run away.
     assert choose_lens(model).lens == HELD
 
