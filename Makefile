@@ -2,6 +2,8 @@
 CORES ?= 2
 PYTHON ?= python3
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
+# Images of containers often set it, and then every job and test worker compiles all modules again.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo check check-gpu test test-faults lint report bench bench-registration bench-nerf bench-scale fuzz mutants audit docs clean
 
