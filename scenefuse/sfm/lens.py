@@ -136,7 +136,7 @@ def choose_lens(
         shared = LENSES[f"{best.name}, shared"]
         fitted, errors = of_best
         if _gain(_errors(shared.fit(fitted), held), errors) < MIN_GAIN:
-            return Choice(shared, best)
+            return Choice(shared, beyond and LENSES[f"{beyond.name}, shared"])
     return Choice(best, beyond)
 
 
