@@ -1,4 +1,4 @@
-"""What photos that people cropped cost: cameras of square crops beside those of whole photos, by one lens and as shipped.
+"""What crops cost: cameras of square crops of photos beside those of the whole ones, by one lens and as shipped.
 
 PYTHONPATH=. python tests/benchmarks/cropped_photos.py --photos data/bronze_statue/near --work results/bench/cropped
 """
