@@ -80,7 +80,8 @@ SHARED = tuple(
         words=f"{lens.words}, all but the principal point in common",
         shared=True,
     )
-    for lens in DISTORTED[1:]
+    for lens in DISTORTED
+    if lens.freedom.principal_point
 )
 LENSES = {lens.name: lens for lens in (KNOWN, *DISTORTED, *SHARED)}
 
